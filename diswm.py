@@ -163,6 +163,7 @@ class Config:
 
     # Behaviour, appendix B.
     horizon: int = flag(15, "imagined transitions, H (table)", low=1)
+    imagine_starts: int = flag(0, "posterior states to imagine from, drawn from the batch; 0: all (ours)", low=0)
     gamma: float = flag(0.99, "discount γ (table)", low=0.0)
     lambda_: float = flag(0.95, "λ of the λ-return (table)", low=0.0)
     rho: float = flag(1.0, "ρ: 1 dynamics backprop, 0 REINFORCE (published)", low=0.0)
@@ -184,8 +185,8 @@ PRESETS = {
     # The same algorithm for two CPU cores. With a batch five times smaller the model wants a larger learning
     # rate. η's clock shrinks with the run (a tenth) and η grows by 50 / 32, since Eq. (3) sums over the window.
     "small": Config(
-        steps=100_000, collect_steps=20_000, pretrain_updates=2_000, prefill=1_000,
-        batch_size=16, batch_length=32, model_lr=1e-3, cnn_depth=16, units=200,
+        steps=100_000, collect_steps=20_000, pretrain_updates=1_000, prefill=1_000, fast_render=True,
+        batch_size=16, batch_length=32, imagine_starts=256, model_lr=1e-3, cnn_depth=16, units=200,
         eta=0.156, eta_end=0.0156, eta_decay=5_000),
     # Seconds, for tests: everything happens, nothing is learnt.
     "debug": Config(
@@ -728,6 +729,9 @@ class Agent:
             self.behaviour.copy_critic()
         start = {key: value.detach().flatten(0, 1) for key, value in out["post"].items()}       # (N, ·): all states
         start_discount = self.cfg.gamma * batch["discount"].flatten()
+        if self.cfg.imagine_starts:
+            chosen = torch.randperm(len(start_discount), device=self.device)[: self.cfg.imagine_starts]
+            start, start_discount = {key: value[chosen] for key, value in start.items()}, start_discount[chosen]
         with autocast(self.cfg, self.device):
             actor_loss, critic_loss, more = self.behaviour.losses(self.model, start, start_discount)
         metrics |= more
