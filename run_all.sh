@@ -1,0 +1,267 @@
+#!/usr/bin/env bash
+# DisWM from a fresh clone: makes .venv, checks OpenGL, then runs the paper's pipeline or the tests.
+# Run it from any folder and as often as you like: finished work is skipped, cut work goes on.
+set -euo pipefail
+CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")"
+
+# Left to itself, MuJoCo picks GLFW, which needs a display.
+export MUJOCO_GL=${MUJOCO_GL:-egl}
+
+# The small preset, cut down until all of it fits into 15 minutes on two CPU cores.
+tour=(--preset small --collect-steps 6000 --pretrain-updates 300 --steps 10000 --prefill 1000
+      --eval-every 2500 --eval-episodes 3)
+
+usage() {
+    cat <<'EOF'
+usage: bash run_all.sh                 a tour of the whole pipeline: 15 minutes on two CPU cores
+       PRESET=small bash run_all.sh    the real thing, sized for two CPU cores: hours
+       PRESET=paper bash run_all.sh    the paper's size: wants a GPU
+       bash run_all.sh test [ARGS]     ruff and the tests; ARGS go to pytest, as in: test -k replay
+
+What the pipeline runs, each a list separated by spaces:
+       PAIRS      source:target tasks, by default "cheetah_run:walker_walk"
+       METHODS    methods of diswm.py, by default "diswm"
+       SEEDS      seeds of the finetunings, by default "0"
+
+Set-up: PYTHON=/path/to/python makes .venv with that Python; MUJOCO_GL=osmesa renders without EGL.
+EOF
+}
+
+die() {  # MESSAGE [EXIT CODE]
+    echo "error: $1" >&2
+    exit "${2:-1}"
+}
+
+# ---- Set-up --------------------------------------------------------------------------------------
+
+usable_python() {  # PYTHON MODULE: does it run, has it the module, and have all pins wheels for it?
+    "$1" -c "import sys, $2; sys.exit(not (3, 11) <= sys.version_info < (3, 13))" >/dev/null 2>&1
+}
+
+find_python() {
+    local candidate candidates=(python3.11 python3.12 python3 python)
+    if [[ -n ${PYTHON:-} ]]; then
+        candidates=("$PYTHON")
+    fi
+    for candidate in "${candidates[@]}"; do
+        if usable_python "$candidate" ensurepip; then  # which venv needs; Debian packs it apart
+            echo "$candidate"
+            return
+        fi
+    done
+    die "no Python >=3.11,<3.13 with its venv module (tried: ${candidates[*]}). On Debian 12 or\
+ Ubuntu 24.04: apt-get install -y python3 python3-venv; or name one: PYTHON=/path/to/python"
+}
+
+make_venv() {
+    local python stamp=.venv/requirements.sha256
+    if ! usable_python .venv/bin/python pip; then
+        python=$(find_python)
+        echo "Making .venv with $("$python" --version)"
+        "$python" -m venv --clear .venv
+    fi
+    # The stamp is written last: after an interrupted or changed installation it does not fit.
+    if ! sha256sum --check --status "$stamp" 2>/dev/null; then
+        echo "Installing requirements.txt into .venv: some minutes, this once"
+        .venv/bin/python -m pip install --disable-pip-version-check -r requirements.txt
+        sha256sum requirements.txt >"$stamp"
+    fi
+}
+
+try_rendering() {  # a real picture: importing MuJoCo already works where rendering does not
+    .venv/bin/python - <<'EOF'
+import mujoco
+
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 64, 64)
+renderer.update_scene(data)
+renderer.render()
+renderer.close()
+EOF
+}
+
+check_opengl() {
+    local why packages install
+    if why=$(try_rendering 2>&1); then
+        return
+    fi
+    case $MUJOCO_GL in
+        egl) packages="libegl1 libgl1 libgl1-mesa-dri" ;;
+        osmesa) packages="libosmesa6" ;;
+        *) die "MuJoCo cannot render with MUJOCO_GL=$MUJOCO_GL; use egl (the default) or osmesa" ;;
+    esac
+    install="apt-get update; apt-get install -y $packages"
+    if [[ $EUID == 0 ]] && command -v apt-get >/dev/null; then
+        echo "MuJoCo cannot render with MUJOCO_GL=$MUJOCO_GL yet; running: $install"
+        export DEBIAN_FRONTEND=noninteractive
+        apt-get update || true  # one unreachable source need not matter
+        # shellcheck disable=SC2086  # several packages
+        apt-get install -y $packages || true  # whether it helped is seen below
+        if why=$(try_rendering 2>&1); then
+            return
+        fi
+    fi
+    die "MuJoCo cannot render with MUJOCO_GL=$MUJOCO_GL (${why##*$'\n'}).\
+ On Debian and Ubuntu, run as root: $install"
+}
+
+# ---- The pipeline --------------------------------------------------------------------------------
+
+diswm() {
+    echo "\$ python diswm.py $*"
+    .venv/bin/python diswm.py "$@"
+}
+
+read_settings() {  # environment variables -> size, runs, pairs, methods, trainings
+    local preset=${PRESET:-tour} pair method seed
+    case $preset in
+        tour) size=("${tour[@]}") ;;
+        small | paper) size=(--preset "$preset") ;;
+        *) die "PRESET=$preset does not exist; use small or paper, or none for the tour" 2 ;;
+    esac
+    runs=runs/$preset  # apart, since a run only goes on with the settings that it was started with
+    size+=(--runs "$runs")
+
+    pairs=${PAIRS:-cheetah_run:walker_walk}
+    methods=${METHODS:-diswm}
+    trainings=()  # of each finetuning: its run folder, then its flags
+    for pair in $pairs; do
+        if [[ ! $pair =~ ^[A-Za-z0-9_-]+:[A-Za-z0-9_-]+$ || ${pair%:*} == "${pair#*:}" ]]; then
+            die "PAIRS: '$pair' is not two different tasks, as in cheetah_run:walker_walk" 2
+        fi
+        for method in $methods; do
+            for seed in ${SEEDS:-0}; do
+                trainings+=("$runs/finetune/${pair/:/-}/$method/seed$seed ${size[*]}\
+ --src ${pair%:*} --dst ${pair#*:} --method $method --seed $seed")
+            done
+        done
+    done
+}
+
+check_settings() {  # a misspelt target or method must not show only after hours of pretraining
+    printf '%s\n' "${trainings[@]}" | .venv/bin/python -c '
+import sys
+import diswm
+
+try:
+    for line in sys.stdin:
+        diswm.parse_args(["finetune", *line.split()[1:]])
+except diswm.UserError as error:
+    print(f"error: {error}", file=sys.stderr)
+    sys.exit(2)'
+}
+
+pretrain_teachers() {  # one per pair and method, with seed 0: it serves all seeds
+    local pair method
+    for pair in $pairs; do
+        for method in $methods; do
+            case $method in
+                dreamerv2 | no_distill) ;;  # learn without videos
+                *)
+                    diswm collect --src "${pair%:*}" "${size[@]}"
+                    diswm pretrain --src "${pair%:*}" --method "$method" "${size[@]}"
+                    ;;
+            esac
+        done
+    done
+}
+
+finetune_into_log() {  # RUN [FLAGS]
+    local run=$1 code=0
+    mkdir -p "$run"
+    echo "started   $run, which writes console.log"
+    diswm finetune "${@:2}" >>"$run/console.log" 2>&1 || code=$?
+    if [[ $code != 0 ]]; then
+        echo "error: $run stopped with exit code $code: $(tail -n 1 "$run/console.log")" >&2
+        return "$code"
+    fi
+    echo "finished  $run"
+}
+
+has_cuda() {
+    .venv/bin/python -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'
+}
+
+finetune_all() {
+    local training flags cores side_by_side
+    cores=$(nproc)
+    side_by_side=$((${#trainings[@]} < cores ? ${#trainings[@]} : cores))
+    if [[ $side_by_side == 1 ]] || has_cuda; then
+        for training in "${trainings[@]}"; do
+            read -ra flags <<<"${training#* }"
+            diswm finetune "${flags[@]}"
+        done
+        return
+    fi
+    # Each gets its share of the cores: two trainings on the same two cores slow each other tenfold.
+    # xargs stays in the foreground, so that Ctrl-C reaches every training.
+    export -f diswm finetune_into_log
+    printf "%s --threads $((cores / side_by_side))\n" "${trainings[@]}" |
+        xargs -P "$side_by_side" -L 1 bash -c 'finetune_into_log "$@"' finetune_into_log ||
+        die "a finetuning failed, see above; run the same command again to go on"
+}
+
+show_results() {
+    local pair training run
+    for training in "${trainings[@]}"; do
+        run=${training%% *}
+        diswm evaluate --run "$run"
+        diswm traverse --run "$run"
+    done
+    for pair in $pairs; do
+        diswm plot "$runs/finetune/${pair/:/-}"/*/seed* --out "$runs/${pair/:/-}.png"
+    done
+
+    echo
+    echo "Done in $((SECONDS / 60)) minutes. In $PWD:"
+    for pair in $pairs; do
+        echo "  learning curves  $runs/${pair/:/-}.png"
+    done
+    for training in "${trainings[@]}"; do
+        run=${training%% *}
+        echo "  pictures, video  $run:" "$(cd "$run" && echo *.png *.mp4)"
+    done
+}
+
+say_tour() {
+    if [[ $runs == runs/tour ]]; then
+        echo
+        echo "This size is a tour, not a result: every stage runs, but too briefly to learn much."
+        echo "The real one: PRESET=small bash run_all.sh   (hours on two CPU cores)"
+        echo
+    fi
+}
+
+# ---- The two commands ----------------------------------------------------------------------------
+
+run_tests() {
+    .venv/bin/python -m ruff check .
+    .venv/bin/python -m pytest test_diswm.py -m "not slow" "$@"  # of two -m, pytest takes the last
+}
+
+run_pipeline() {
+    say_tour
+    check_settings
+    pretrain_teachers
+    finetune_all
+    show_results
+    say_tour
+}
+
+if [[ $# == 0 ]]; then
+    read_settings
+    make_venv
+    check_opengl
+    run_pipeline
+elif [[ $1 == test ]]; then
+    make_venv
+    check_opengl
+    run_tests "${@:2}"
+elif [[ $1 == -h || $1 == --help ]]; then
+    usage
+else
+    usage >&2
+    exit 2
+fi
