@@ -30,7 +30,6 @@ Symbols, and their names in the code:
 
 import argparse
 import atexit
-import bisect
 import contextlib
 import ctypes
 import dataclasses
@@ -44,9 +43,13 @@ import platform
 import resource
 import shutil
 import statistics
+import struct
 import sys
 import time
+import timeit
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -75,23 +78,17 @@ class UserError(Exception):
         self.code = code
 
 # === Config =======================================================================================
-
 def flag(default, help, *, low=0, choices=None, free=False):
-    """A Config field that is also a command-line flag.
-
-    low: the least allowed number. free: may change when a run is resumed.
-    """
-    return dataclasses.field(default=default, metadata=dict(help=help, low=low, choices=choices,
-                                                            free=free))
+    """A Config field and its flag. low: the least number; free: may change on resuming."""
+    meta = dict(help=help, low=low, choices=choices, free=free)
+    return dataclasses.field(default=default, metadata=meta)
 
 @dataclass(frozen=True)
 class Config:
     """Everything that can be set; the defaults are the paper's (`--preset paper`).
-
     Sources: "table" is the paper's hyperparameter table, "published" the authors' configuration,
     "ours" a choice of this implementation. An *env step* is one simulator step; a *decision* is one
-    action of the agent, held for `action_repeat` env steps.
-    """
+    action of the agent, held for `action_repeat` env steps."""
     # What is run, and where it is kept.
     src: str = flag("cheetah_run", "task of the distracting videos (paper, Fig. 4a)")
     dst: str = flag("walker_walk", "target task (paper, Fig. 4a)")
@@ -103,8 +100,7 @@ class Config:
     # Environment (section 4).
     action_repeat: int = flag(2, "env steps per decision (published)", low=1)
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
-    colors: str = flag("published", "colour boxes: around fixed centres, or the original colours "
-                       "(published; paper)", choices=("published", "original"))
+    colors: str = flag("published", "box centres (published)", choices=("published", "original"))
     color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)")
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
@@ -120,8 +116,7 @@ class Config:
     eval_episodes: int = flag(10, "episodes per evaluation (published)", low=1)
     replay_capacity: int = flag(1_000_000, "rows kept in the replay (published)", low=1)
     # World model, Eqs. (1), (2), (4), (5).
-    encoder: str = flag("beta_vae", "image encoder and decoder; conv is DreamerV2's (paper)",
-                        choices=("beta_vae", "conv"))
+    encoder: str = flag("beta_vae", "conv: as in DreamerV2 (paper)", choices=("beta_vae", "conv"))
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1)
     cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1)
     stoch: int = flag(50, "size of the stochastic state (published)", low=1)
@@ -140,8 +135,7 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "KL of softmaxed latents, or of Gaussian posteriors "
-                        "(paper; ours)", choices=("softmax", "gaussian"))
+    distill: str = flag("softmax", "form of Eq. (3) (paper; ours)", choices=("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
@@ -158,8 +152,7 @@ class Config:
     slow_every: int = flag(100, "updates between copies to the slow critic (published)", low=1)
     grad_clip: float = flag(100.0, "largest gradient norm of each optimiser (published)")
     # Machine.
-    device: str = flag("auto", "where to compute (ours)", choices=("auto", "cpu", "cuda"),
-                       free=True)
+    device: str = flag("auto", "where it runs (ours)", choices=("auto", "cpu", "cuda"), free=True)
     precision: str = flag("auto", "of convolutions and MLPs; auto: bf16 where native (ours)",
                           choices=("auto", "fp32", "bf16"), free=True)
     threads: int = flag(0, "CPU threads; 0: one per core (ours)", free=True)
@@ -189,7 +182,6 @@ METHODS = {
 }
 
 # === Maths: pure functions of tensors =============================================================
-
 ACTION_LIMIT = 1 - 1e-6  # actions stay strictly inside (−1, 1)
 
 def gaussian_kl(mean_p, std_p, mean_q, std_q):
@@ -199,70 +191,56 @@ def gaussian_kl(mean_p, std_p, mean_q, std_q):
 
 def beta_vae_kl(mean, logvar):
     """Disentanglement loss of Eqs. (2), (5): KL[N(mean, exp(logvar)) || N(0, I)].
-
-    mean, logvar: (..., Z). Returns (...,), nats summed over the latent dimensions.
-    """
+    mean, logvar: (..., Z). Returns (...,), nats summed over the latent dimensions."""
     # ½ Σ (μ² + σ² − 1 − ln σ²)
     return 0.5 * (mean**2 + logvar.exp() - 1 - logvar).sum(-1)
 
 def rssm_kl_loss(post, prior, balance=0.8, free_nats=1.0):
     """KL of posterior and prior in Eqs. (2), (5), with DreamerV2's balancing and free nats.
-
         balance · max(mean KL[sg(q) || p], free) + (1 − balance) · max(mean KL[q || sg(p)], free)
-
     post, prior: dicts of `mean` and `std`, (B, T, S). Returns (loss, value): a scalar and the plain
-    KL (B, T), nats. Free nats act on the batch mean, as published: below them it is constant.
-    """
+    KL (B, T), nats. Free nats act on the batch mean, as published: below them it is constant."""
+
     def kl(q, p):
         return gaussian_kl(q["mean"], q["std"], p["mean"], p["std"]).sum(-1)
 
     def sg(dist):  # this side is the target of the other
         return {"mean": dist["mean"].detach(), "std": dist["std"].detach()}
-
     value = kl(post, sg(prior))                                               # (B, T), trains q
     prior_side = kl(sg(post), prior).mean().clamp(min=free_nats)              # trains p
     return balance * prior_side + (1 - balance) * value.mean().clamp(min=free_nats), value
 
 def distillation_loss(z_disen, z_task):
     """Latent distillation, Eq. (3): KL(z_disen || z_task) = Σ z_disen · ln(z_disen / z_task).
-
     Softmax over the latent dimensions makes probability vectors of both, so a constant added to all
     dimensions changes nothing. z_disen (the teacher's), z_task: samples, (B, T, Z). Returns a
-    scalar, nats: summed over time, mean over the batch, the scale at which the paper tuned η.
-    """
+    scalar, nats: summed over time, mean over the batch, the scale at which the paper tuned η."""
     log_disen = z_disen.detach().log_softmax(-1)                              # the teacher is fixed
     log_task = z_task.log_softmax(-1)
     return (log_disen.exp() * (log_disen - log_task)).sum((-2, -1)).mean()
 
 def gaussian_distillation_loss(teacher, task):
     """Eq. (3) between the two Gaussian posteriors instead (ours), reduced like it.
-
-    teacher, task: dicts of `mean` and `logvar`, (B, T, Z).
-    """
+    teacher, task: dicts of `mean` and `logvar`, (B, T, Z)."""
     kl = gaussian_kl(teacher["mean"].detach(), (teacher["logvar"].detach() / 2).exp(),
                      task["mean"], (task["logvar"] / 2).exp())
     return kl.sum((-2, -1)).mean()
 
 def eta_schedule(step, start=0.1, end=0.01, decay_steps=50_000, delay=0):
     """η after `step` decisions (section 3.4): 0 before `delay`, then linearly from start to end.
-
-    The line would reach 0 at delay + decay_steps; η rests at `end` where it meets it.
-    """
+    The line would reach 0 at delay + decay_steps; η rests at `end` where it meets it."""
     return 0.0 if step < delay else max(start * (1 - (step - delay) / decay_steps), end)
 
 def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
     """λ-target V_t (appendix B), the actor's objective and the critic's regression target.
-
         V_t = r_t + γ_t · ((1 − λ) · v_{t+1} + λ · V_{t+1}),    V_H = v_H = bootstrap
 
               t      0     1    …   H−1    H
          reward     r_0   r_1      r_{H−1}
           value     v_0   v_1      v_{H−1}  bootstrap
          return     V_0   V_1      V_{H−1}
-
     reward, value, discount: (H, ...) time-major; bootstrap: (...). Returns (H, ...).
-    Differentiable in every argument: "dynamics backprop" flows through r, γ and v.
-    """
+    Differentiable in every argument: "dynamics backprop" flows through r, γ and v."""
     next_value = torch.cat([value[1:], bootstrap[None]])                      # v_{t+1}: (H, ...)
     returns, target = [], bootstrap
     for t in reversed(range(len(reward))):
@@ -270,12 +248,10 @@ def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
         returns.append(target)
     return torch.stack(returns[::-1])                                         # back in time order
 
-def squared_error(target, prediction):
-    """−ln N(target; prediction, 1) without its constant ½ ln 2π, elementwise."""
+def squared_error(target, prediction):  # −ln N(target; prediction, 1), less ½ ln 2π, elementwise
     return 0.5 * (target - prediction)**2
 
-def gaussian_sample(mean, std):
-    """A reparameterised draw: the gradient reaches mean and std."""
+def gaussian_sample(mean, std):  # a reparameterised draw: the gradient reaches mean and std
     return mean + std * torch.randn_like(std)
 
 def clip_action(action):
@@ -291,63 +267,50 @@ def normal_entropy(std):
     return (std.log() + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
 
 # === Networks =====================================================================================
+def stack(layer, sizes, shapes):
+    """Layers from size to size, each with ELU behind; shapes: (kernel, stride, padding) of each."""
+    return [part for n, m, shape in zip(sizes[:-1], sizes[1:], shapes, strict=True)
+            for part in (layer(n, m, *shape), nn.ELU())]
 
-def mlp(inputs, units, layers, outputs):
-    """`layers` hidden layers of `units` with ELU, then a linear layer."""
-    sizes = [inputs] + [units] * layers
-    hidden = [part for n, m in zip(sizes, sizes[1:], strict=False)
-              for part in (nn.Linear(n, m), nn.ELU())]
-    return nn.Sequential(*hidden, nn.Linear(sizes[-1], outputs))
+def mlp(inputs, units, layers, outputs):  # `layers` hidden layers with ELU, then a linear one
+    hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
+    return nn.Sequential(*hidden, nn.Linear(units, outputs))
 
-def bounded_std(x):
-    """A standard deviation in (0.1, 2.1): 2 σ(x / 2) + 0.1."""
+def bounded_std(x):  # a standard deviation in (0.1, 2.1): 2 σ(x / 2) + 0.1
     return 2 * torch.sigmoid(x / 2) + 0.1
 
-def kaiming(module):
-    """Kaiming-normal weights and zero biases, for the β-VAE only (published)."""
+def kaiming(module):  # Kaiming-normal weights and zero biases, for the β-VAE only (published)
     if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
         nn.init.kaiming_normal_(module.weight)
         nn.init.zeros_(module.bias)
 
-def preprocess(image):
-    """uint8 (..., 64, 64, 3) → float (..., 3, 64, 64) in [−0.5, 0.5]."""
+def preprocess(image):  # uint8 (..., 64, 64, 3) → float (..., 3, 64, 64) in [−0.5, 0.5]
     return image.movedim(-1, -3).float() / 255 - 0.5
 
 class PerFrame(nn.Module):
     """`self.net` applied to the last `dims` dimensions; all before them are one batch. fp32 out."""
+    dims = 3
 
     def forward(self, x):
-        """(..., *in) → (..., *out)."""
         lead = x.shape[:x.dim() - self.dims]
         return self.net(x.reshape(-1, *x.shape[len(lead):])).float().unflatten(0, lead)
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
 
-    dims = 3
-
     def __init__(self, z_dim=20, depth=32):
         super().__init__()
         self.embed_dim, d = z_dim, depth
-        self.net = nn.Sequential(
-            nn.Conv2d(3, d, 4, 2, 1), nn.ELU(),                               # 64 → 32
-            nn.Conv2d(d, d, 4, 2, 1), nn.ELU(),                               # 16
-            nn.Conv2d(d, 2 * d, 4, 2, 1), nn.ELU(),                           # 8
-            nn.Conv2d(2 * d, 2 * d, 4, 2, 1), nn.ELU(),                       # 4
-            nn.Conv2d(2 * d, 8 * d, 4), nn.ELU(),                             # 1
-            nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
+        shapes = [(4, 2, 1)] * 4 + [(4,)]                                     # 32, 16, 8, 4, 1
+        convolutions = stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes)
+        self.net = nn.Sequential(*convolutions, nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
         self.apply(kaiming)
 
     def forward(self, image):
-        """→ mean, logvar."""
         return super().forward(image).chunk(2, -1)
 
 class BetaVAEDecoder(PerFrame):
-    """Decoder of Eqs. (1), (4): feat (..., S + D) → image mean (..., 3, 64, 64).
-
-    The feature passes a neck as narrow as 𝐳 (published).
-    """
-
+    """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
     dims = 1
 
     def __init__(self, feat_dim, z_dim=20, depth=32):
@@ -355,50 +318,37 @@ class BetaVAEDecoder(PerFrame):
         d = depth
         self.net = nn.Sequential(
             nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
-            nn.Unflatten(-1, (8 * d, 1, 1)),
-            nn.ConvTranspose2d(8 * d, 2 * d, 4), nn.ELU(),                    # 1 → 4
-            nn.ConvTranspose2d(2 * d, 2 * d, 4, 2, 1), nn.ELU(),              # 8
-            nn.ConvTranspose2d(2 * d, d, 4, 2, 1), nn.ELU(),                  # 16
-            nn.ConvTranspose2d(d, d, 4, 2, 1), nn.ELU(),                      # 32
-            nn.ConvTranspose2d(d, 3, 4, 2, 1))                                # 64
+            nn.Unflatten(-1, (8 * d, 1, 1)), *stack(
+                nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], [(4,)] + [(4, 2, 1)] * 3),
+            nn.ConvTranspose2d(d, 3, 4, 2, 1))                                # 4, 8, 16, 32, 64
         self.apply(kaiming)
 
 class ConvEncoder(PerFrame):
     """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32·depth)."""
 
-    dims = 3
-
     def __init__(self, depth=32):
         super().__init__()
         self.embed_dim, d = 32 * depth, depth                                 # 8·depth of 2 × 2
-        self.net = nn.Sequential(
-            nn.Conv2d(3, d, 4, 2), nn.ELU(), nn.Conv2d(d, 2 * d, 4, 2), nn.ELU(),
-            nn.Conv2d(2 * d, 4 * d, 4, 2), nn.ELU(), nn.Conv2d(4 * d, 8 * d, 4, 2), nn.ELU(),
-            nn.Flatten())
+        convolutions = stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4)
+        self.net = nn.Sequential(*convolutions, nn.Flatten())
 
 class ConvDecoder(PerFrame):
     """DreamerV2's decoder, for the baselines: feat (..., S + D) → (..., 3, 64, 64)."""
-
     dims = 1
 
     def __init__(self, feat_dim, depth=32):
         super().__init__()
         d = depth
         self.net = nn.Sequential(
-            nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)),
-            nn.ConvTranspose2d(32 * d, 4 * d, 5, 2), nn.ELU(),                # 1 → 5
-            nn.ConvTranspose2d(4 * d, 2 * d, 5, 2), nn.ELU(),                 # 13
-            nn.ConvTranspose2d(2 * d, d, 6, 2), nn.ELU(),                     # 30
-            nn.ConvTranspose2d(d, 3, 6, 2))                                   # 64
+            nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)), *stack(
+                nn.ConvTranspose2d, [32 * d, 4 * d, 2 * d, d], [(5, 2), (5, 2), (6, 2)]),
+            nn.ConvTranspose2d(d, 3, 6, 2))                                   # 5, 13, 30, 64
 
 class RSSM(nn.Module):
     """Recurrent state-space model, Gaussian; action_dim=0 makes it the action-free one of Eq. (1).
-
         h_t = f(h_{t−1}, z_{t−1}, a_{t−1})    z_t ~ q(z_t | h_t, embed_t)    ẑ_t ~ p(ẑ_t | h_t)
-
     A state: dict of `deter` h (..., D), `stoch` z, and the `mean`, `std` it came from (..., S).
     What lines up in a window, which is also how the replay stores it:
-
           row t       0      1      …
          image       o_0    o_1
         action        0      a that led to o_1     (the paper's a_{t−1})
@@ -418,34 +368,28 @@ class RSSM(nn.Module):
         self.post_net = mlp(deter + embed_dim, hidden, 1, 2 * stoch)
 
     @staticmethod
-    def feat(state):
-        """What decoder, heads, actor and critic see: [z_t, h_t], (..., S + D)."""
+    def feat(state):  # what decoder, heads, actor and critic see: [z_t, h_t], (..., S + D)
         return torch.cat([state["stoch"], state["deter"]], -1)
 
-    def initial(self, batch):
-        """The zero state for a batch."""
+    def initial(self, batch):  # the zero state for a batch
         return {key: self.norm.weight.new_zeros(batch, size) for key, size in self.sizes.items()}
 
-    def recur(self, state, action):
-        """h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU with layer norm. action (B, A), or None."""
+    def recur(self, state, action):  # h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm
         x = torch.cat([state["stoch"], action], -1) if self.action_dim else state["stoch"]
         gates = self.norm(self.gru(torch.cat([self.inputs(x), state["deter"]], -1)).float())
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         return torch.lerp(state["deter"], candidate, torch.sigmoid(update - 1))         # (B, D)
 
-    def draw(self, net, inputs, deter):
-        """A state around h_t: its distribution from `net`, and a sample."""
+    def draw(self, net, inputs, deter):  # a state around h_t: `net`'s distribution, a sample
         mean, std = net(inputs).float().chunk(2, -1)
         std = bounded_std(std)
         return dict(deter=deter, mean=mean, std=std, stoch=gaussian_sample(mean, std))
 
-    def prior(self, deter):
-        """ẑ_t ~ p(ẑ_t | h_t)."""
+    def prior(self, deter):  # ẑ_t ~ p(ẑ_t | h_t)
         return self.draw(self.prior_net, deter, deter)
 
-    def posterior(self, deter, embed):
-        """z_t ~ q(z_t | h_t, embed_t)."""
+    def posterior(self, deter, embed):  # z_t ~ q(z_t | h_t, embed_t)
         return self.draw(self.post_net, torch.cat([deter, embed], -1), deter)
 
     def step(self, state, action, embed, is_first):
@@ -459,13 +403,11 @@ class RSSM(nn.Module):
         state, states = self.initial(len(embed)), []
         for t in range(embed.shape[1]):
             previous = action[:, t] if self.action_dim else None
-            state = self.step(state, previous, embed[:, t], is_first[:, t])
-            states.append(state)
+            states.append(state := self.step(state, previous, embed[:, t], is_first[:, t]))
         post = {key: torch.stack([s[key] for s in states], 1) for key in state}
         return post, self.prior(post["deter"])                                # all steps at once
 
 # === Video predictor and world model ==============================================================
-
 class VideoPredictor(nn.Module):
     """The action-free video prediction model of Eq. (1), trained by Eq. (2)."""
 
@@ -483,22 +425,18 @@ class VideoPredictor(nn.Module):
 
     def encode(self, image):
         """image (..., 3, 64, 64) → (embed, code).
-
-        β-VAE: a sample of 𝐳 (..., Z), and its dict of mean and logvar. DreamerV2's encoder: {}.
-        """
+        β-VAE: a sample of 𝐳 (..., Z), and its dict of mean and logvar. DreamerV2's encoder: {}."""
         if isinstance(self.encoder, BetaVAEEncoder):
             mean, logvar = self.encoder(image)
             return gaussian_sample(mean, (logvar / 2).exp()), dict(mean=mean, logvar=logvar)
         return self.encoder(image), {}
 
-    def forward(self, batch):
-        """Filter a batch (image preprocessed) → dict of embed, code, post, prior, feat."""
+    def forward(self, batch):  # filter → dict of embed, code, post, prior, feat
         embed, code = self.encode(batch["image"])
         post, prior = self.rssm.observe(embed, batch.get("action"), batch["is_first"])
         return dict(embed=embed, code=code, post=post, prior=prior, feat=self.rssm.feat(post))
 
-    def terms(self, out, batch):
-        """Loss terms of each step, (B, T), nats, but for the KL."""
+    def terms(self, out, batch):  # loss terms of each step, (B, T), nats, but for the KL
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
         error = squared_error(batch["image"], self.decoder(out["feat"]))
         terms = dict(image=error.sum((-3, -2, -1)))
@@ -506,9 +444,7 @@ class VideoPredictor(nn.Module):
 
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
-
-        teacher: dict of embed, mean, logvar of the same images from the frozen teacher, or None.
-        """
+        teacher: dict of embed, mean, logvar of the same images from the frozen teacher, or None."""
         cfg, terms = self.cfg, self.terms(out, batch)
         loss, kl = rssm_kl_loss(out["post"], out["prior"], cfg.kl_balance, cfg.free_nats)
         metrics = dict(kl_loss=loss, kl=kl.mean(), eta=torch.tensor(eta),
@@ -519,10 +455,9 @@ class VideoPredictor(nn.Module):
             metrics[name] = term.mean()
             loss = loss + self.scales[name] * metrics[name]
         if teacher is not None:
-            metrics["distill"] = (distillation_loss(teacher["embed"], out["embed"])
-                                  if cfg.distill == "softmax" else
-                                  gaussian_distillation_loss(teacher, out["code"]))
-            loss = loss + eta * metrics["distill"]
+            distill = (distillation_loss(teacher["embed"], out["embed"]) if cfg.distill == "softmax"
+                       else gaussian_distillation_loss(teacher, out["code"]))
+            loss, metrics["distill"] = loss + eta * distill, distill
         return loss, metrics
 
 class WorldModel(VideoPredictor):
@@ -535,25 +470,20 @@ class WorldModel(VideoPredictor):
         self.reward = mlp(cfg.stoch + cfg.deter, cfg.units, 2, 1)
         self.discount = mlp(cfg.stoch + cfg.deter, cfg.units, 3, 1)
 
-    def predict_reward(self, feat):
-        """r̂, the mean of a unit Gaussian: (..., S + D) → (...,)."""
+    def predict_reward(self, feat):  # r̂, the mean of a unit Gaussian: (..., S + D) → (...,)
         return self.reward(feat).squeeze(-1).float()
 
-    def predict_discount(self, feat):
-        """The logit of γ̂: (..., S + D) → (...,)."""
+    def predict_discount(self, feat):  # the logit of γ̂: (..., S + D) → (...,)
         return self.discount(feat).squeeze(-1).float()
 
-    def terms(self, out, batch):
-        """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
+    def terms(self, out, batch):  # those of Eq. (2), the reward's and the discount's, (B, T) each
         reward = squared_error(batch["reward"], self.predict_reward(out["feat"]))
         # DEVIATION: the discount head of Eq. (4) is trained; the published code switches it off.
-        discount = F.binary_cross_entropy_with_logits(
-            self.predict_discount(out["feat"]), self.cfg.gamma * batch["discount"],
-            reduction="none")                                                 # γ · (1 − terminal)
+        logit, target = self.predict_discount(out["feat"]), self.cfg.gamma * batch["discount"]
+        discount = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
         return super().terms(out, batch) | dict(reward=reward, discount=discount)
 
 # === Actor-critic: behaviour learning in imagination, appendix B ==================================
-
 class ActorCritic(nn.Module):
     """Actor π(a | s), critic v(s), and a slow copy of the critic that gives the targets."""
 
@@ -565,30 +495,25 @@ class ActorCritic(nn.Module):
         self.slow_critic = mlp(feat_dim, cfg.units, 3, 1).requires_grad_(False)   # only copied
         self.copy_critic()
 
-    def copy_critic(self):
-        """Slow critic ← critic."""
+    def copy_critic(self):  # slow critic ← critic
         self.slow_critic.load_state_dict(self.critic.state_dict())
 
-    def policy(self, feat):
-        """feat (..., S + D) → mean in (−1, 1) and std of the normal of actions, (..., A) each."""
+    def policy(self, feat):  # → mean in (−1, 1) and std of the normal of actions, (..., A)
         mean, std = self.actor(feat).float().chunk(2, -1)
         return torch.tanh(mean), bounded_std(std)
 
-    def value(self, feat, slow=False):
-        """v(s): (..., S + D) → (...,)."""
+    def value(self, feat, slow=False):  # v(s): (..., S + D) → (...,)
         return (self.slow_critic if slow else self.critic)(feat).squeeze(-1).float()
 
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
-
               t        0     1    …   H−1      H
             feat      s_0   s_1      s_{H−1}  s_H     s_0 a posterior, the others imagined
           action      a_0   a_1      a_{H−1}          a_t is taken in s_t and leads to s_{t+1}
           reward      r_0   r_1      r_{H−1}          r̂(s_t)
         discount      γ_0   γ_1      γ_{H−1}          γ̂(s_t)
 
-        Returns feats (H + 1, N, S + D), log_probs and entropies (H, N).
-        """
+        Returns feats (H + 1, N, S + D), log_probs and entropies (H, N)."""
         state, feats, log_probs, entropies = start, [model.rssm.feat(start)], [], []
         for _ in range(self.cfg.horizon):
             # The policy takes its state as given; its gradient comes from where the action leads.
@@ -603,10 +528,8 @@ class ActorCritic(nn.Module):
 
     def losses(self, model, start, start_discount):
         """start: dict of (N, ·) detached states; start_discount (N,): their true γ_0.
-
         Returns (actor_loss, critic_loss, metrics). The actor's graph runs through the world model,
-        which is *not* trained here: take gradients for the actor's own parameters only.
-        """
+        which is *not* trained here: take gradients for the actor's own parameters only."""
         cfg = self.cfg
         feats, log_prob, entropy = self.imagine(model, start)
         reward = model.predict_reward(feats[:-1])                             # (H, N)
@@ -617,7 +540,6 @@ class ActorCritic(nn.Module):
         target = lambda_return(reward, slow[:-1], discount, slow[-1], cfg.lambda_)
         # w_t = Π_{i<t} γ_i: how likely the episode still runs. A weight, nothing to optimise.
         weight = torch.cat([torch.ones_like(discount[:1]), discount[:-1]]).cumprod(0).detach()
-
         regression = target.detach()                                          # sg(V_t)
         value = self.value(feats[:-1].detach())                               # the model is fixed
         critic_loss = (weight * squared_error(regression, value)).mean()
@@ -635,8 +557,7 @@ def freeze(encoder):
     # DEVIATION: the published code switches the teacher's gradients back on and trains it along.
     return encoder.eval().requires_grad_(False)
 
-def adam(module, lr):
-    """The optimiser of a module's parameters (published)."""
+def adam(module, lr):  # the optimiser of a module's parameters (published)
     return torch.optim.Adam(module.parameters(), lr=lr, eps=1e-5)
 
 def autocast(cfg):
@@ -644,16 +565,13 @@ def autocast(cfg):
     # 1.5× of a whole step on a CPU with native bf16.
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
 
-def to_device(batch, device):
-    """numpy arrays → tensors on the device, images preprocessed."""
+def to_device(batch, device):  # numpy arrays → tensors on the device, images preprocessed
     batch = {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
     return batch | {"image": preprocess(batch["image"])}
 
 def gradient_step(optimizer, loss, metrics, clip):
     """Minimise loss over the optimiser's own parameters. Returns the gradient norm before clipping.
-
-    Raises UserError at a non-finite loss or gradient, before anything is changed.
-    """
+    Raises UserError at a non-finite loss or gradient, before anything is changed."""
     parameters = optimizer.param_groups[0]["params"]
     optimizer.zero_grad()
     loss.backward(inputs=parameters)  # the actor's graph runs through the model, which gets none
@@ -679,9 +597,7 @@ class Agent:
     @torch.no_grad()
     def act(self, image, action, state, explore):
         """Decide. image: uint8 (N, 64, 64, 3); action: the previous one, (N, A); state: None first.
-
-        explore: sample the actor, else take its mode. Returns action, numpy (N, A), and the state.
-        """
+        explore: sample the actor, else take its mode. Returns action, numpy (N, A), and state."""
         is_first = torch.full((len(image),), state is None, device=self.device)
         state = self.model.rssm.initial(len(image)) if state is None else state
         embed, _ = self.model.encode(preprocess(torch.as_tensor(image, device=self.device)))
@@ -690,8 +606,7 @@ class Agent:
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
 
-    def teach(self, image):
-        """What the frozen teacher sees in the images: dict of embed, mean, logvar; or None."""
+    def teach(self, image):  # what the frozen teacher sees: embed, mean, logvar; or None
         if self.teacher is None:
             return None
         with torch.no_grad():                                                 # its knowledge stays
@@ -700,10 +615,9 @@ class Agent:
 
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
-
-        update: index of this step. probe: measure the distillation's own gradient at the encoder.
-        """
+        update: index of this step. probe: measure distillation's own gradient at the encoder."""
         cfg, batch = self.cfg, to_device(batch, self.device)
+        optimizers, clip = self.optimizers, self.cfg.grad_clip
         with autocast(cfg):
             out = self.model(batch)
             loss, metrics = self.model.loss(out, batch, self.teach(batch["image"]), eta)
@@ -711,8 +625,7 @@ class Agent:
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
             metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
-        metrics["model_grad_norm"] = gradient_step(self.optimizers["model"], loss, metrics,
-                                                   cfg.grad_clip)
+        metrics["model_grad_norm"] = gradient_step(optimizers["model"], loss, metrics, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
         # Imagine from the posteriors of the batch, which are data here.
@@ -725,31 +638,26 @@ class Agent:
             *losses, more = self.behaviour.losses(self.model, start, start.pop("discount"))
         metrics |= more
         for name, loss in zip(("actor", "critic"), losses, strict=True):
-            metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, metrics,
-                                                         cfg.grad_clip)
+            metrics[f"{name}_grad_norm"] = gradient_step(optimizers[name], loss, metrics, clip)
         return {key: value.detach() for key, value in metrics.items()}
 
     def state_dict(self):
-        """All that a step changes."""
         return dict(model=self.model.state_dict(), behaviour=self.behaviour.state_dict(),
                     optimizers={name: opt.state_dict() for name, opt in self.optimizers.items()})
 
     def load_state_dict(self, state):
-        """The inverse."""
         self.model.load_state_dict(state["model"])
         self.behaviour.load_state_dict(state["behaviour"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
 
 # === Replay and video sets: episodes on disk ======================================================
-
 # A row holds an image and what led to it (see RSSM for how rows line up).
 ROW = dict(image=np.uint8, action=np.float32, reward=np.float32, discount=np.float32,
            is_first=np.bool_, is_terminal=np.bool_)
 VIDEO_KEYS = ("image", "is_first")  # all that a video predictor may see
 
-def make_row(image, action, reward=0.0, terminal=False, first=False):
-    """One row of an episode."""
+def make_row(image, action, reward=0.0, terminal=False, first=False):  # one row of an episode
     return dict(image=image, action=action, reward=reward, discount=1.0 - terminal, is_first=first,
                 is_terminal=terminal)
 
@@ -766,12 +674,15 @@ def atomic(path):
     finally:
         temporary.unlink(missing_ok=True)
 
+# What zipfile, numpy and torch raise at files that were cut off, altered, or never theirs.
+DAMAGED = (zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError,
+           pickle.UnpicklingError, ValueError, TypeError, LookupError, EOFError, RuntimeError,
+           OverflowError, SyntaxError, AttributeError)
+
 def npz_layout(path, keys):
     """Where the arrays of an .npz lie in the file: {key: (offset, dtype, shape)}, bytes.
-
     The offset of a compressed array is None. Raises UserError unless `keys` are plain arrays with
-    a row for each image, and images uint8 (T, 64, 64, 3).
-    """
+    a row for each image, and images uint8 (T, 64, 64, 3)."""
     layout = {}
     try:
         with zipfile.ZipFile(path) as archive, open(path, "rb") as file:
@@ -780,11 +691,13 @@ def npz_layout(path, keys):
                     np.lib.format.read_magic(member)
                     shape, _, dtype = np.lib.format.read_array_header_1_0(member)
                     header = member.tell()
+                if info.file_size != header + math.prod(shape) * dtype.itemsize:
+                    raise ValueError(f"{info.filename} is cut off, or no plain array")
                 file.seek(info.header_offset + 26)   # the local header, 30 bytes, ends in
-                behind = 30 + int(np.frombuffer(file.read(4), "<u2").sum())   # two lengths
+                header += 30 + int(np.frombuffer(file.read(4), "<u2").sum())  # two lengths
                 stored = info.compress_type == zipfile.ZIP_STORED
-                layout[info.filename.removesuffix(".npy")] = (
-                    info.header_offset + behind + header if stored else None, dtype, shape)
+                offset = info.header_offset + header if stored else None
+                layout[info.filename.removesuffix(".npy")] = offset, dtype, shape
         length = len(range(layout["image"][2][0]))
         if layout["image"][1:] != (np.dtype(np.uint8), (length, 64, 64, 3)):
             raise ValueError("image is {1} {2}, not uint8 (T, 64, 64, 3)".format(*layout["image"]))
@@ -793,37 +706,36 @@ def npz_layout(path, keys):
                 raise ValueError(f"{key} is {layout[key][1]} {layout[key][2]} for {length} images")
     except KeyError as error:
         raise UserError(f"{path} has no array {error}; it needs {', '.join(keys)}") from None
-    except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError, IndexError) as error:
+    except DAMAGED as error:
         raise UserError(f"{path} is not an episode ({error}); remove it and run again") from None
     return layout
 
 class Replay:
     """Finished episodes, a file each, laid end to end; windows start uniformly anywhere.
 
-    Only an index is in memory; `sample` reads the rows of its windows. `np.load` opens a file; it
+    Only an index is in memory; `sample` maps the rows of its windows. `np.load` opens a file; it
     is not compressed, so the rows of an array follow each other in it.
-
         episodes    ┌──────── 0 ────────┐┌──── 1 ────┐┌─────── 2 ──────
         rows        F . . . . . . . . . .F . . . . . .F . . . . . . . .      F: is_first
         a window                [. . . . . . F . . .]
     """
 
     def __init__(self, folder, capacity=None, keys=tuple(ROW)):
-        self.folder, self.capacity, self.keys = Path(folder), capacity, keys
+        # All files at first: a checkpoint may need those that the ones after it pushed out.
+        self.folder, self.capacity, self.keys = Path(folder), None, keys
         self._hold([(path, npz_layout(path, keys)) for path in sorted(self.folder.glob("*.npz"))])
-        last = self.paths[-1].stem if self.paths else "-1"
-        self.next_index = int(last) + 1 if last.lstrip("-").isdigit() else 0
+        self.capacity = capacity
+        last = self.paths[-1].stem if self.paths else ""
+        self.next_index = int(last) + 1 if last.isdigit() else 0
 
-    def _hold(self, episodes):
-        """Index these (path, layout) pairs, less the oldest ones beyond capacity."""
+    def _hold(self, episodes):  # index (path, layout) pairs, less the oldest beyond capacity
         lengths = [layout["image"][2][0] for _, layout in episodes]
         while self.capacity and sum(lengths[1:]) >= self.capacity:
             del episodes[0], lengths[0]
         self.episodes, self.ends = episodes, np.cumsum(lengths).tolist()
         self.paths, self.rows = [path for path, _ in episodes], sum(lengths)
 
-    def add(self, rows):
-        """Append a finished episode, a list of `make_row`."""
+    def add(self, rows):  # append a finished episode, a list of `make_row`
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{self.next_index:06d}.npz"
         with atomic(path) as file:
@@ -831,44 +743,36 @@ class Replay:
         self._hold([*self.episodes, (path, npz_layout(path, self.keys))])
         self.next_index += 1
 
-    def prune(self):
-        """Delete files that are not in the index, once no checkpoint needs them any more."""
+    def prune(self):  # delete files not in the index, once no checkpoint needs them
         for path in set(self.folder.glob("*.npz")) - set(self.paths):
             path.unlink()
 
-    def state_dict(self):
-        """Which episodes there are: the numbers of the first one and of the next to come."""
+    def state_dict(self):  # which episodes there are: the first one and the next to come
         first = int(self.paths[0].stem) if self.paths else self.next_index
         return dict(first=first, next=self.next_index)
 
-    def load_state_dict(self, state):
-        """Return to those episodes; later ones, of a run cut off before its checkpoint, go."""
+    def load_state_dict(self, state):  # later episodes, of a run cut off, go
         first, self.next_index = state["first"], state["next"]
-        self._hold([e for e in self.episodes if first <= int(e[0].stem) < self.next_index])
+        numbers = {f"{number:06d}" for number in range(first, self.next_index)}
+        self._hold([episode for episode in self.episodes if episode[0].stem in numbers])
         if len(self.paths) != self.next_index - first:
             raise UserError(f"{self.folder} lacks episodes of its checkpoint; start over: --fresh")
         self.prune()
 
-    def window(self, start, length):
-        """Rows start … start + length − 1 of all episodes end to end: dict of (T, ...)."""
+    def window(self, start, length):  # rows start … start + length − 1: dict of (T, ...)
         pieces = {key: [] for key in self.keys}
         while length > 0:
-            index = bisect.bisect_right(self.ends, start)
+            index = np.searchsorted(self.ends, start, "right")
             count = min(length, self.ends[index] - start)
             path, layout = self.episodes[index]
             row = start - self.ends[index] + layout["image"][2][0]            # within the episode
-            with open(path, "rb") as file:
-                for key in self.keys:
-                    offset, dtype, shape = layout[key]
-                    width = math.prod(shape[1:])
-                    file.seek(offset + row * width * dtype.itemsize)
-                    piece = np.fromfile(file, dtype, count * width)
-                    pieces[key].append(piece.reshape(count, *shape[1:]))
+            for key in self.keys:
+                offset, dtype, shape = layout[key]
+                pieces[key].append(np.memmap(path, dtype, "r", offset, shape)[row:row + count])
             start, length = start + count, length - count
         return {key: np.concatenate(piece) for key, piece in pieces.items()}
 
-    def sample(self, batch_size, length, rng):
-        """Windows, dict of (B, T, ...); the first row of each counts as `is_first`."""
+    def sample(self, batch_size, length, rng):  # dict of (B, T, ...); windows begin is_first
         starts = rng.integers(0, self.rows - length + 1, batch_size)
         windows = [self.window(int(start), length) for start in starts]
         batch = {key: np.stack([window[key] for window in windows]) for key in self.keys}
@@ -877,9 +781,7 @@ class Replay:
 
 def open_videos(folder, cache):
     """The .npz episodes of a folder as a Replay of images.
-
-    Foreign ones (the authors' are compressed and lack is_first) are unpacked into `cache`, once.
-    """
+    Foreign ones (the authors' are compressed and lack is_first) are unpacked into `cache`, once."""
     layouts = {path: npz_layout(path, ("image",)) for path in sorted(Path(folder).glob("*.npz"))}
     if not layouts:
         raise UserError(f"no episodes (*.npz) in {folder}; run: python diswm.py collect --src TASK")
@@ -888,16 +790,20 @@ def open_videos(folder, cache):
     cache.mkdir(parents=True, exist_ok=True)
     for path in layouts:
         if not (cache / path.name).exists():
-            with np.load(path, allow_pickle=False) as episode, atomic(cache / path.name) as file:
-                image = episode["image"]
+            try:
+                with np.load(path, allow_pickle=False) as episode:
+                    image = episode["image"]
+            except DAMAGED as error:
+                raise UserError(f"{path} is damaged ({error}); remove it and run again") from None
+            with atomic(cache / path.name) as file:
                 np.savez(file, image=image, is_first=np.arange(len(image)) == 0)
     return Replay(cache, keys=VIDEO_KEYS)
 
 # === Environments =================================================================================
-
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
+TRAINING, EVALUATION = 0, 1  # streams of episode_seed
 
 class DMControlEnv(gym.Env):
     """A task of dm_control.suite as a gymnasium.Env with a flat state observation."""
@@ -915,18 +821,15 @@ class DMControlEnv(gym.Env):
         raise AttributeError(name)
 
     def reset(self, *, seed=None, options=None):
-        """Start an episode; a seed determines all of it."""
         super().reset(seed=seed)
         if seed is not None:
             self.env.task.random.seed(seed)
         return self.env.reset().observation["observations"], {}
 
-    def step(self, action):
-        """One simulator step. A time limit truncates, only a zero discount terminates."""
+    def step(self, action):  # a time limit truncates, only a zero discount terminates
         step = self.env.step(action)
-        terminated = step.last() and step.discount == 0
-        return (step.observation["observations"], float(step.reward), terminated,
-                step.last() and not terminated, {})
+        obs, terminated = step.observation["observations"], step.last() and step.discount == 0
+        return obs, float(step.reward), terminated, step.last() and not terminated, {}
 
 class ActionRepeat(gym.Wrapper):
     """Hold an action for n simulator steps, sum the rewards; info["env_steps"] counts the steps."""
@@ -935,11 +838,9 @@ class ActionRepeat(gym.Wrapper):
         super().__init__(env)
         self.n = n
 
-    def step(self, action):
-        """Stops early where the episode ends."""
+    def step(self, action):  # stops early where the episode ends
         # DEVIATION: the published code repeats in two wrappers (really 4) and doubles rewards.
-        total = 0.0
-        terminated = truncated = steps = 0
+        total, steps, terminated, truncated = 0.0, 0, False, False
         while steps < self.n and not (terminated or truncated):
             obs, reward, terminated, truncated, info = self.env.step(action)
             total, steps = total + reward, steps + 1
@@ -947,9 +848,7 @@ class ActionRepeat(gym.Wrapper):
 
 def color_box(phase, original, colors="published", half_range=0.2):
     """What a phase draws colours from: (low, high), each (n, 3) in 0..1, like `original`.
-
-    Around the original colours, `shifted` rotates their channels (ours).
-    """
+    Around the original colours, `shifted` rotates their channels (ours)."""
     if phase == "none":
         return original, original
     phase = "shifted" if phase == "eval" else phase                           # DMC keeps none apart
@@ -961,9 +860,7 @@ def color_box(phase, original, colors="published", half_range=0.2):
 
 class ColorDistractor(gym.Wrapper):
     """Each episode, draw the colours of all materials from a random stream of their own.
-
-    reset(options={"phase": …}) changes the phase from then on. Only what is rendered changes.
-    """
+    reset(options={"phase": …}) changes the phase from then on. Only what is rendered changes."""
 
     def __init__(self, env, phase, colors="published", half_range=0.2, step_std=0.0):
         super().__init__(env)
@@ -972,8 +869,7 @@ class ColorDistractor(gym.Wrapper):
         self.original = self.unwrapped.model.mat_rgba[:, :3].copy()
         self.rng = np.random.default_rng()
 
-    def reset(self, *, seed=None, options=None):
-        """New colours; a seed determines them."""
+    def reset(self, *, seed=None, options=None):  # new colours; a seed determines them
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
         self.phase = (options or {}).get("phase", self.phase)
@@ -981,8 +877,7 @@ class ColorDistractor(gym.Wrapper):
         self.unwrapped.model.mat_rgba[:, :3] = self.rng.uniform(*self.box)
         return self.env.reset(seed=seed, options=options)
 
-    def step(self, action):
-        """Optionally, the colours walk at random within the box."""
+    def step(self, action):  # optionally, the colours walk at random within the box
         rgb = self.unwrapped.model.mat_rgba[:, :3]
         if self.step_std:
             rgb[:] = np.clip(rgb + self.rng.normal(0, self.step_std, rgb.shape), *self.box)
@@ -990,13 +885,9 @@ class ColorDistractor(gym.Wrapper):
 
 class Pixels(gym.ObservationWrapper):
     """Observe what camera 0 sees, uint8 (size, size, 3), through a renderer of one's own.
-
     mujoco.Renderer makes its GL context current before each use; the simulators' render() does not,
-    and then two of them in one process silently show each other's textures.
-    """
-
-    metadata = {"render_modes": ["rgb_array"]}
-    render_mode = "rgb_array"
+    and then two of them in one process silently show each other's textures."""
+    metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
 
     def __init__(self, env, size=64, fast=False):
         super().__init__(env)
@@ -1009,16 +900,13 @@ class Pixels(gym.ObservationWrapper):
         atexit.register(self.renderer.close)  # one that is open at exit prints GL errors
 
     def observation(self, observation):
-        """The picture of the current state."""
         self.renderer.update_scene(self.unwrapped.data, camera=0)
         return self.renderer.render()
 
     def render(self):
-        """The same, for gymnasium."""
         return self.observation(None)
 
-    def close(self):
-        """Free the GL context, then the simulator."""
+    def close(self):  # free the GL context, then the simulator
         atexit.unregister(self.renderer.close)
         self.renderer.close()
         super().close()
@@ -1026,19 +914,16 @@ class Pixels(gym.ObservationWrapper):
 def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colors="published",
              color_range=0.2, color_step_std=0.0, fast_render=False, size=64, pixels=True):
     """The one env stack: simulator, actions in [−1, 1], time limit, action repeat, colours, pixels.
-
     phase: "train", "shifted" (colours after the midpoint), "eval" (those that a finished run is
     judged in; on DMC the shifted ones) or "none" (the task's own). time_limit: simulator steps, 0
     for the task's own. pixels=False leaves the state observation and renders nothing. Returns a
-    gymnasium.Env of uint8 (size, size, 3) images. UserError: unknown task or phase, no OpenGL.
-    """
+    gymnasium.Env of uint8 (size, size, 3) images. UserError: unknown task or phase, no OpenGL."""
     if task not in TASKS or phase not in PHASES:
         wrong, known = (task, TASKS) if task not in TASKS else (phase, PHASES)
         near = " or ".join(difflib.get_close_matches(wrong, known)) or "none is similar"
         raise UserError(f"unknown '{wrong}' ({near}); there are: {', '.join(known)}", code=2)
     env = gym.wrappers.RescaleAction(DMControlEnv(*TASKS[task]), np.float32(-1), np.float32(1))
-    env = gym.wrappers.TimeLimit(env, time_limit or 1000)                     # DMC's are all 1000
-    env = ActionRepeat(env, action_repeat)
+    env = ActionRepeat(gym.wrappers.TimeLimit(env, time_limit or 1000), action_repeat)  # DMC's 1000
     env = ColorDistractor(env, phase, colors, color_range, color_step_std)
     if pixels:
         try:
@@ -1049,24 +934,18 @@ def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colo
     env.reset(seed=seed)
     return env
 
-def config_env(cfg, task, phase, **kwargs):
-    """make_env with the values of a Config."""
+def config_env(cfg, task, phase, **kwargs):  # make_env with the values of a Config
     return make_env(task, phase=phase, action_repeat=cfg.action_repeat, time_limit=cfg.time_limit,
                     colors=cfg.colors, color_range=cfg.color_range, fast_render=cfg.fast_render,
                     color_step_std=cfg.color_step_std, **kwargs)
 
-TRAINING, EVALUATION = 0, 1  # streams of episode_seed
-
-def episode_seed(seed, stream, index):
-    """The seed of an episode: a function of the run's seed, the purpose and the episode's index."""
+def episode_seed(seed, stream, index):  # of the run's seed, the purpose and the index
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
 
 def play_episode(env, policy, seed, phase, each=None):
     """Play one episode → its rows (see make_row).
-
     policy(image, action, state) → (action, state), given the previous action and, at first, None.
-    each(info) is called after each decision; the episode is cut where it returns true.
-    """
+    each(info) is called after each decision; the episode is cut where it returns true."""
     image, _ = env.reset(seed=seed, options=dict(phase=phase))
     action, state, done = np.zeros(env.action_space.shape, np.float32), None, False
     rows = [make_row(image, action, first=True)]
@@ -1074,28 +953,21 @@ def play_episode(env, policy, seed, phase, each=None):
         action, state = policy(image, action, state)
         image, reward, terminated, truncated, info = env.step(action)
         rows.append(make_row(image, action, reward, terminated))
-        done = terminated or truncated
-        done = bool(each and each(info)) or done
+        done = bool(each and each(info)) or terminated or truncated
     return rows
 
-def episode_return(rows):
-    """The sum of an episode's rewards."""
-    return math.fsum(row["reward"] for row in rows)
-
-def random_policy(env, seed):
-    """Uniform actions in [−1, 1]."""
+def random_policy(env, seed):  # uniform actions in [−1, 1]
     rng = np.random.default_rng(seed)
     return lambda image, action, state: (rng.uniform(-1, 1, action.shape).astype(np.float32), None)
 
-def agent_policy(agent, explore):
-    """The agent's actor: sampled when exploring, else its mode."""
+def agent_policy(agent, explore):  # the agent's actor: sampled when exploring, else its mode
+
     def policy(image, action, state):
         actions, state = agent.act(image[None], action[None], state, explore)
         return actions[0], state
     return policy
 
 # === Runs: folders, checkpoints, logs, and the training loop ======================================
-
 def run_folder(cfg, stage):
     """runs/<stage>/<tasks>/<method>/seed<k>, so that the same command finds its run again."""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
@@ -1108,9 +980,9 @@ def read_checkpoint(path):
         state["config"] = Config(**state["config"])
         return dict(state) | {key: state[key] for key in ("stage", "trainer", "rng", "log_bytes")}
     except FileNotFoundError:
-        raise UserError(f"there is no checkpoint {path}; train that run first") from None
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError,
-            AttributeError) as error:
+        raise UserError(f"there is no checkpoint {path}; train that run first, for instance: "
+                        "python diswm.py finetune --dst walker_walk") from None
+    except (*DAMAGED, OSError) as error:
         reason = (str(error).splitlines() or [""])[0][:80]
         raise UserError(f"{path} is not a checkpoint of ours ({type(error).__name__}: {reason}); "
                         "restore it, or start over with --fresh") from None
@@ -1133,22 +1005,19 @@ class Run:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
 
-    def save(self, trainer):
-        """Write the checkpoint, whole or not at all."""
+    def save(self, trainer):  # write the checkpoint, whole or not at all
         self.folder.mkdir(parents=True, exist_ok=True)
-        config = dataclasses.asdict(self.cfg)
+        config, cpu = dataclasses.asdict(self.cfg), torch.get_rng_state()
         cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
+        log_bytes = self.log_path.stat().st_size if self.log_path.exists() else 0
         buffer = io.BytesIO()  # a full disk is then an OSError of the file, not one inside torch
         torch.save(dict(config=config, stage=self.stage, trainer=trainer.state_dict(),
-                        rng=dict(cpu=torch.get_rng_state(), cuda=cuda),
-                        log_bytes=self.log_path.stat().st_size if self.log_path.exists() else 0),
-                   buffer)
+                        rng=dict(cpu=cpu, cuda=cuda), log_bytes=log_bytes), buffer)
         with atomic(self.checkpoint) as file:
             file.write(buffer.getbuffer())
         (self.folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
 
-    def restore(self, trainer):
-        """Back to the checkpoint: trainer, random numbers, and the log as it was then."""
+    def restore(self, trainer):  # trainer, random numbers, and the log as it was then
         trainer.load_state_dict(self.state["trainer"])
         torch.set_rng_state(self.state["rng"]["cpu"])
         if self.state["rng"]["cuda"] is not None and self.cfg.device == "cuda":
@@ -1157,13 +1026,8 @@ class Run:
             os.truncate(self.log_path, self.state["log_bytes"])              # the rest comes again
 
 def train(trainer, run):
-    """The one training loop: resume; then work, log, checkpoint, until the stage is done.
-
-    A trainer has `progress` and `total` in `unit`s, advance() → a row of metrics, saved(), and
-    state_dict(), load_state_dict().
-    """
+    """The one training loop: resume; then work, log, checkpoint, until the Trainer's total."""
     from torch.utils.tensorboard import SummaryWriter  # slow to import
-
     if run.state:
         run.restore(trainer)
         print(f"resuming at {trainer.progress:,} of {trainer.total:,} {trainer.unit}", flush=True)
@@ -1187,10 +1051,9 @@ def train(trainer, run):
             bar.set_postfix_str(shown, refresh=False)
             bar.update(trainer.progress - bar.n)
             if bar.disable:                                                   # not a terminal
-                left = (trainer.total - trainer.progress) / row["rate"]
+                left = tqdm.format_interval((trainer.total - trainer.progress) / row["rate"])
                 print(f"{trainer.progress:,}/{trainer.total:,} {trainer.unit}  {shown}  "
-                      f"{row['rate']:.1f} {trainer.unit}/s  "
-                      f"ETA {tqdm.format_interval(left)}", flush=True)
+                      f"{row['rate']:.1f} {trainer.unit}/s  ETA {left}", flush=True)
     print(f"done: {run.folder}")
 
 def mean_metrics(rows):
@@ -1199,10 +1062,28 @@ def mean_metrics(rows):
     return {name: torch.stack([row[name] for row in rows if name in row]).float().mean().item()
             for name in names}
 
-class VideoTrainer:
-    """Stage 2, Algorithm 1 lines 4–8: the video predictor. Progress is in updates."""
+class Trainer:
+    """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics.
+    What changes: `parts` that have a state_dict, and `counters`."""
+    counters = ("progress",)
 
-    unit, shown, chunk = "updates", ("image", "kl", "disentangle"), 100       # updates per log row
+    def saved(self):
+        """A checkpoint was written."""
+
+    def state_dict(self):
+        parts = {name: getattr(self, name).state_dict() for name in self.parts}
+        return parts | {name: getattr(self, name) for name in self.counters}
+
+    def load_state_dict(self, state):
+        for name in self.parts:
+            getattr(self, name).load_state_dict(state[name])
+        for name in self.counters:
+            setattr(self, name, state[name])
+
+class VideoTrainer(Trainer):
+    """Stage 2, Algorithm 1 lines 4–8: the video predictor. Progress is in updates."""
+    unit, shown, parts = "updates", ("image", "kl", "disentangle"), ("model", "optimizer")
+    chunk = 100                                                               # updates per log row
 
     def __init__(self, cfg, videos, device):
         self.cfg, self.videos, self.device = cfg, videos, device
@@ -1210,16 +1091,14 @@ class VideoTrainer:
         self.optimizer = adam(self.model, cfg.model_lr)
         self.progress, self.total = 0, cfg.pretrain_updates
 
-    def update(self, batch):
-        """One step of Eq. (2) on numpy arrays (B, T, ...) → metrics."""
+    def update(self, batch):  # one step of Eq. (2) on numpy arrays (B, T, ...) → metrics
         batch = to_device(batch, self.device)
         with autocast(self.cfg):
             loss, metrics = self.model.loss(self.model(batch), batch)
         norm = gradient_step(self.optimizer, loss, metrics, self.cfg.grad_clip)
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
 
-    def advance(self):
-        """Some updates → a row of the log."""
+    def advance(self):  # some updates → a row of the log
         metrics, cfg = [], self.cfg
         for _ in range(min(self.chunk, self.total - self.progress)):
             rng = np.random.default_rng([cfg.seed, self.progress])            # nothing to save
@@ -1228,29 +1107,15 @@ class VideoTrainer:
             self.progress += 1
         return dict(update=self.progress) | mean_metrics(metrics)
 
-    def saved(self):
-        """A checkpoint was written."""
-
     def state_dict(self):
-        """All that an update changes, and where the videos are."""
-        return dict(model=self.model.state_dict(), optimizer=self.optimizer.state_dict(),
-                    progress=self.progress, videos=str(self.videos.folder))
+        return super().state_dict() | dict(videos=str(self.videos.folder))
 
-    def load_state_dict(self, state):
-        """The inverse."""
-        self.model.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.progress = state["progress"]
-
-class AgentTrainer:
+class AgentTrainer(Trainer):
     """Stages 1 and 3, Algorithm 1 lines 9–25: an agent in an environment. Progress in env steps.
-
     It works episode by episode. A checkpoint falls between two of them, so no simulator or
-    recurrent state is in it; the colours, η and all seeds follow from the counters.
-    """
-
+    recurrent state is in it; the colours, η and all seeds follow from the counters."""
     unit, shown = "env steps", ("train_return", "eval_return", "image", "reward", "kl", "eta")
-    counters = ("progress", "decisions", "updates", "episodes")
+    parts, counters = ("agent", "replay"), ("progress", "decisions", "updates", "episodes")
 
     def __init__(self, cfg, folder, device, teacher=None):
         self.cfg = cfg
@@ -1261,60 +1126,50 @@ class AgentTrainer:
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
 
     @property
-    def phase(self):
-        """The colours of an episode that starts now: they switch once, at the midpoint."""
+    def phase(self):  # the colours of an episode that starts now: they switch once, at the midpoint
         return "train" if self.progress < self.switch_step else "shifted"
 
-    def updates_due(self):
-        """How many updates follow the decision just made."""
+    def updates_due(self):  # how many updates follow the decision just made
         cfg = self.cfg
         if self.decisions < cfg.prefill or self.replay.rows < cfg.batch_length:
             return 0
         return int(self.decisions % cfg.train_every == 0) if self.updates else cfg.first_updates
 
-    def learn(self):
-        """Do the updates that are due → a list of their metrics."""
+    def learn(self):  # do the updates that are due → a list of their metrics
         cfg, metrics = self.cfg, []
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
         for _ in range(self.updates_due()):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
-            probe = self.updates % 100 == 0
-            metrics.append(self.agent.update(batch, eta, self.updates, probe))
+            metrics.append(self.agent.update(batch, eta, self.updates, self.updates % 100 == 0))
             self.updates += 1
         return metrics
 
     def play(self):
         """A training episode, learning on the way → its rows, and the metrics of its updates.
-
-        It ends with the simulator's episode, at the colour switch, or with the run.
-        """
+        It ends with the simulator's episode, at the colour switch, or with the run."""
         cfg, metrics = self.cfg, []
         seed = episode_seed(cfg.seed, TRAINING, self.episodes)
         random, actor = random_policy(self.env, seed), agent_policy(self.agent, explore=True)
         limit = self.switch_step if self.progress < self.switch_step else self.total
-
         def policy(*args):
             return (random if self.decisions < cfg.prefill else actor)(*args)
-
         def each(info):
             self.decisions += 1
             self.progress += info["env_steps"]
             metrics.extend(self.learn())
             return self.progress >= limit
-
         return play_episode(self.env, policy, seed, self.phase, each), metrics
 
-    def advance(self):
-        """An episode, and an evaluation when one is due → a row of the log."""
+    def advance(self):  # an episode, and an evaluation when one is due → a row of the log
         cfg, phase, before = self.cfg, self.phase, self.progress
         rows, metrics = self.play()
         self.replay.add(rows)
         self.episodes += 1
-        row = dict(step=self.progress, phase=phase, train_return=episode_return(rows),
-                   train_length=len(rows) - 1) | mean_metrics(metrics)
-        row |= {name: getattr(self, name) for name in self.counters[1:]}
+        total = math.fsum(row["reward"] for row in rows)
+        row = dict(step=self.progress, phase=phase, train_return=total, train_length=len(rows) - 1)
+        row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
         due = self.progress // cfg.eval_every > before // cfg.eval_every
         if due or self.progress >= self.total:
             returns, _ = evaluate_agent(cfg, self.agent, self.eval_env, phase)
@@ -1322,51 +1177,31 @@ class AgentTrainer:
                         eval_std=statistics.pstdev(returns))
         return row
 
-    def saved(self):
-        """A checkpoint was written: episodes that only the one before needed can go."""
+    def saved(self):  # a checkpoint was written: episodes that only the one before needed can go
         self.replay.prune()
 
-    def state_dict(self):
-        """All that an episode changes; and the teacher, so that the run needs no other file."""
-        teacher, counters = self.agent.teacher, {n: getattr(self, n) for n in self.counters}
+    def state_dict(self):  # and the teacher, so that the run needs no other file
+        teacher = self.agent.teacher
         if teacher:
             teacher = dict(depth=teacher.net[0].out_channels, weights=teacher.state_dict())
-        return dict(agent=self.agent.state_dict(), replay=self.replay.state_dict(), teacher=teacher,
-                    action_dim=self.agent.action_dim, **counters)
-
-    def load_state_dict(self, state):
-        """The inverse; the teacher is given at construction."""
-        self.agent.load_state_dict(state["agent"])
-        self.replay.load_state_dict(state["replay"])
-        for name in self.counters:
-            setattr(self, name, state[name])
-
-@contextlib.contextmanager
-def random_numbers(seed):
-    """Inside, torch draws from `seed`; outside, it goes on as if nothing had been drawn."""
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        yield
+        return super().state_dict() | dict(teacher=teacher, action_dim=self.agent.action_dim)
 
 def evaluate_agent(cfg, agent, env, phase):
     """Play `eval_episodes` episodes, the same seeds every time; agent None: random actions.
-
-    Returns their returns and the rows of the first one. Training's random numbers stay untouched.
-    """
+    Returns their returns and the first one's rows. Training's random numbers stay untouched."""
     returns, first = [], None
-    with random_numbers(cfg.seed):
+    with torch.random.fork_rng():
+        torch.manual_seed(cfg.seed)
         for index in range(cfg.eval_episodes):
             seed = episode_seed(cfg.seed, EVALUATION, index)
             policy = agent_policy(agent, explore=False) if agent else random_policy(env, seed)
             rows = play_episode(env, policy, seed, phase)
-            returns.append(episode_return(rows))
+            returns.append(math.fsum(row["reward"] for row in rows))
             first = first or rows
     return returns, first
 
 # === Stages =======================================================================================
-
-def announce(cfg, stage, folder, frames):
-    """Say what is about to run, on what, what it needs and where it goes."""
+def announce(cfg, stage, folder, frames):  # what runs, on what, its needs and folder
     disk = 0.1 + frames * 12.35e-6                                            # GB; a row is 12.3 kB
     memory = 0.8 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 2e-5
     print(f"{stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
@@ -1411,15 +1246,12 @@ def pretrain(cfg, fresh=False):
     torch.manual_seed(cfg.seed)
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
-def finetune(cfg, fresh=False):
-    """Stage 3: distil, adapt, learn behaviour in the target task."""
+def finetune(cfg, fresh=False):  # stage 3: distil, adapt, learn behaviour in the target task
     train_agent(cfg, "finetune", fresh)
 
 def find_teacher(cfg, device):
     """The frozen encoder of a video predictor: --teacher, or the one of --src and this method.
-
-    Prefers the run's own seed, else the first. Raises UserError with the command that makes one.
-    """
+    Prefers the run's own seed, else the first. Raises UserError with the command that makes one."""
     own = run_folder(cfg, "pretrain")
     found = [own / "checkpoint.pt", *sorted(own.parent.glob("seed*/checkpoint.pt"))]
     path = Path(cfg.teacher) if cfg.teacher else next((p for p in found if p.exists()), None)
@@ -1436,9 +1268,8 @@ def find_teacher(cfg, device):
         raise UserError(f"{path} is a {saved.encoder} {state['stage']} run, no teacher; {command}")
     if saved.src == cfg.dst:
         raise UserError(f"{path} saw videos of the target, {cfg.dst}; choose another --src")
-    if saved.z_dim != cfg.z_dim:
-        raise UserError(f"{path} has {saved.z_dim} latents, this run {cfg.z_dim}; add --z-dim "
-                        f"{saved.z_dim}")
+    if (z := saved.z_dim) != cfg.z_dim:
+        raise UserError(f"{path} has {z} latents, this run {cfg.z_dim}; add --z-dim {z}")
     if done < saved.pretrain_updates:
         raise UserError(f"{path} is not finished ({done} of {saved.pretrain_updates}); {command}")
     print(f"teacher: {path} ({saved.src}, {done:,} updates)")
@@ -1459,18 +1290,16 @@ def load_model(folder, device):
     state = read_checkpoint(Path(folder) / "checkpoint.pt")
     cfg, trainer = replace(state["config"], device=device.type, precision="fp32"), state["trainer"]
     if state["stage"] == "pretrain":
-        model = VideoPredictor(cfg).to(device)
-        model.load_state_dict(trainer["model"])
-        return cfg, model, trainer
-    agent = Agent(cfg, trainer["action_dim"], device, saved_teacher(trainer, cfg, device))
-    agent.load_state_dict(trainer["agent"])
-    return cfg, agent, trainer
+        model, weights = VideoPredictor(cfg).to(device), trainer["model"]
+    else:
+        model = Agent(cfg, trainer["action_dim"], device, saved_teacher(trainer, cfg, device))
+        weights = trainer["agent"]
+    model.load_state_dict(weights)
+    return cfg, model, trainer
 
 def evaluate(folder, device, episodes=None):
     """Stage 4: episodes with the actor's mode, and as many with random actions.
-
-    Writes evaluation.json, and the first episode as evaluation.mp4, into the run's folder.
-    """
+    Writes evaluation.json, and the first episode as evaluation.mp4, into the run's folder."""
     folder = Path(folder)
     cfg, agent, trainer = load_model(folder, device)
     if not isinstance(agent, Agent):
@@ -1480,8 +1309,7 @@ def evaluate(folder, device, episodes=None):
     result = dict(task=cfg.dst, phase="shifted" if switched else "train", step=trainer["progress"])
     for name, policy in (("", agent), ("random_", None)):
         # Nobody looks at what the random policy sees.
-        env = config_env(cfg, cfg.dst, "train", pixels=policy is not None)
-        with contextlib.closing(env):
+        with contextlib.closing(config_env(cfg, cfg.dst, "train", pixels=bool(policy))) as env:
             returns, rows = evaluate_agent(cfg, policy, env, result["phase"])
         result |= {f"{name}returns": returns, f"{name}mean": statistics.fmean(returns),
                    f"{name}std": statistics.pstdev(returns)}
@@ -1494,26 +1322,23 @@ def evaluate(folder, device, episodes=None):
           f"{len(returns)} episodes each\nwrote evaluation.json and evaluation.mp4 in {folder}")
 
 # === Figures ======================================================================================
-
 TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
 
-def to_picture(image):
-    """float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)."""
+def to_picture(image):  # float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)
     return ((image.movedim(-3, -1) + 0.5).clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 @torch.no_grad()
 def latent_traversal(model, batch):
     """Vary one latent at a time (paper, Fig. 5). batch: one window (1, T, ...), preprocessed.
-
-    𝐳 of the last image, with z_i = v, goes through posterior (mean) and decoder. Returns pictures,
-    uint8 (Z, 1 + values, 64, 64, 3), first the reconstruction; and each latent's mean KL, nats.
-    """
+    𝐳 of the first image, with z_i = v, goes through posterior (mean) and decoder: without a past,
+    all that the model knows is 𝐳. Returns pictures, uint8 (Z, 1 + values, 64, 64, 3), first the
+    reconstruction; and each latent's KL in nats, averaged over the window, (Z,)."""
     out = model(batch)
     mean, logvar = (out["code"][key][0] for key in ("mean", "logvar"))        # (T, Z)
     values, size = torch.tensor(TRAVERSAL, device=mean.device), mean.shape[-1]
-    z = mean[-1].repeat(size, 1 + len(values), 1)                             # (Z, 1 + values, Z)
+    z = mean[0].repeat(size, 1 + len(values), 1)                             # (Z, 1 + values, Z)
     z[torch.arange(size), 1:, torch.arange(size)] = values.to(z.dtype)
-    deter = out["post"]["deter"][0, -1].expand(*z.shape[:2], -1)
+    deter = out["post"]["deter"][0, 0].expand(*z.shape[:2], -1)
     state = model.rssm.posterior(deter, z)
     pictures = to_picture(model.decoder(torch.cat([state["mean"], deter], -1)))
     return pictures, beta_vae_kl(mean[..., None], logvar[..., None]).mean(0).cpu().numpy()
@@ -1521,9 +1346,7 @@ def latent_traversal(model, batch):
 @torch.no_grad()
 def open_loop(model, batch, context=5):
     """Filter `context` images, predict the others unseen. batch: one window (1, T, ...).
-
-    The actions are the window's own. Returns uint8 (3, T, 64, 64, 3): truth, model, error.
-    """
+    The actions are the window's own. Returns uint8 (3, T, 64, 64, 3): truth, model, error."""
     out = model({key: value[:, :context] for key, value in batch.items()})
     state, feats = {key: value[:, -1] for key, value in out["post"].items()}, [out["feat"]]
     for t in range(context, batch["image"].shape[1]):
@@ -1533,40 +1356,35 @@ def open_loop(model, batch, context=5):
     truth, prediction = batch["image"][0], model.decoder(torch.cat(feats, 1))[0].clamp(-0.5, 0.5)
     return np.stack([to_picture(x) for x in (truth, prediction, (prediction - truth) / 2)])
 
-def save_figure(figure, path):
-    """Write a matplotlib figure."""
-    figure.savefig(path, dpi=100, bbox_inches="tight")
-    print(f"wrote {path}")
-
 def draw_grid(pictures, rows, columns, path, title=""):
     """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
     from matplotlib.figure import Figure  # slow to import
-
     r, c = pictures.shape[:2]
-    figure = Figure(figsize=(c * 0.75 + 1, r * 0.75 + 0.5))
-    axes = figure.subplots()
+    axes = Figure(figsize=(c * 0.75 + 1, r * 0.75 + 0.5)).subplots()
     axes.imshow(pictures.transpose(0, 2, 1, 3, 4).reshape(r * 64, c * 64, 3))
     axes.set_yticks(np.arange(r) * 64 + 32, rows)
     axes.set_xticks(np.arange(c) * 64 + 32, columns)
-    axes.set_title(title)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.set_frame_on(False)
-    save_figure(figure, path)
+    axes.set(title=title, frame_on=False)
+    axes.figure.savefig(path, dpi=100, bbox_inches="tight")
+    print(f"wrote {path}")
 
 def traverse(folder, device):
     """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder."""
     folder = Path(folder)
     cfg, model, trainer = load_model(folder, device)
-    if isinstance(model, Agent):
-        model, replay = model.model, Replay(folder / "episodes")
-    else:
-        replay = Replay(trainer["videos"], keys=VIDEO_KEYS)
+    online = isinstance(model, Agent)
+    replay = Replay(folder / "episodes") if online else Replay(trainer["videos"], keys=VIDEO_KEYS)
+    model = model.model if online else model
     if not replay.rows:
         raise UserError(f"the episodes of {folder} are gone; nothing to draw from")
-    start = [0, *replay.ends][-2]                     # the last episode: the colours of the end
+    # From the middle of the last episode: the colours of the end, and a pose that is not the start.
+    start = ([0, *replay.ends][-2] + replay.rows) // 2
     window = replay.window(start, min(50, replay.rows - start))
+    window["is_first"][0] = True
     batch = to_device({key: value[None] for key, value in window.items()}, device)
-    with random_numbers(cfg.seed):
+    with torch.random.fork_rng():
+        torch.manual_seed(cfg.seed)
         strip = open_loop(model, batch)
         frames = range(0, strip.shape[1], 4)
         draw_grid(strip[:, ::4], ("truth", "model", "error"), frames, folder / "open_loop.png",
@@ -1588,59 +1406,49 @@ def read_log(folder):
 def plot(folders, path):
     """Evaluation returns of runs …/<tasks>/<method>/seed<k>: mean and spread over seeds."""
     from matplotlib.figure import Figure  # slow to import
-
     curves = {}                                           # {tasks: {method: [{step: return}]}}
     for folder in map(Path, folders):
-        rows = [row for row in read_log(folder) if "eval_return" in row]
-        curve = {row["step"]: row["eval_return"] for row in rows}
+        curve = {r["step"]: r["eval_return"] for r in read_log(folder) if "eval_return" in r}
         if curve:
             *_, tasks, method, _ = folder.resolve().parts
             curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
     figure = Figure(figsize=(5.5 * len(curves), 3.8))
-    for axes, (tasks, methods) in zip(figure.subplots(1, len(curves), squeeze=False)[0],
-                                      curves.items(), strict=True):
+    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+    for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
         for method, runs in sorted(methods.items()):
             steps = sorted(set.intersection(*map(set, runs)))
             values = np.array([[run[step] for step in steps] for run in runs])
             mean, spread = values.mean(0), values.std(0)
             line, = axes.plot(steps, mean, marker=".", label=f"{method}, {len(runs)} seed(s)")
-            axes.fill_between(steps, mean - spread, mean + spread, alpha=0.2,
-                              color=line.get_color())
+            color = line.get_color()
+            axes.fill_between(steps, mean - spread, mean + spread, alpha=0.2, color=color)
         axes.set(title=tasks.replace("-", " → "), xlabel="env steps", ylabel="evaluation return",
                  ylim=(0, None))
         axes.legend()
         axes.grid(alpha=0.3)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    save_figure(figure, path)
+    figure.savefig(path, dpi=100, bbox_inches="tight")
+    print(f"wrote {path}")
 
 # === Doctor and bench =============================================================================
-
 def doctor(cfg):
     """Print versions and device; render a frame of each env family in each phase to doctor.png."""
     print(f"python {platform.python_version()}  torch {torch.__version__}  mujoco "
           f"{mujoco.__version__}  gymnasium {gym.__version__}\n{cfg.device}, {cfg.precision}, "
           f"{torch.get_num_threads()} threads, MUJOCO_GL={os.environ['MUJOCO_GL']}")
-    rows, pictures = (cfg.dst,), []                                           # one family so far
-    for task, phase in ((task, phase) for task in rows for phase in PHASES):
-        with contextlib.closing(config_env(cfg, task, phase)) as env:
+    pictures = []
+    for phase in PHASES:
+        with contextlib.closing(config_env(cfg, cfg.dst, phase)) as env:
             pictures.append(env.reset(seed=cfg.seed)[0])
     Path(cfg.runs).mkdir(parents=True, exist_ok=True)
-    sheet = np.stack(pictures).reshape(len(rows), len(PHASES), 64, 64, 3)
-    draw_grid(sheet, rows, PHASES, Path(cfg.runs) / "doctor.png")
+    draw_grid(np.array([pictures]), [cfg.dst], PHASES, Path(cfg.runs) / "doctor.png")
 
-def median_ms(function, repeats=5):
-    """Median wall time of a call in milliseconds, after one to warm up."""
-    times = []
-    for _ in range(repeats + 1):
-        began = time.perf_counter()
-        function()
-        times.append(1e3 * (time.perf_counter() - began))
-    return statistics.median(times[1:])
+def median_ms(function, repeats=5):  # median wall time of a call, after one to warm up
+    return 1e3 * statistics.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
 
-def parameter_counts(agent):
-    """Numbers of parameters by part, and in total."""
+def parameter_counts(agent):  # numbers of parameters by part, and in total
     parts = dict(world_model=agent.model, teacher=agent.teacher, actor=agent.behaviour.actor,
                  critic=agent.behaviour.critic, slow_critic=agent.behaviour.slow_critic)
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
@@ -1648,8 +1456,8 @@ def parameter_counts(agent):
 
 def bench(cfg):
     """Count parameters; time an update, a pretraining update, a frame and a decision."""
-    device, rng, shape = torch.device(cfg.device), np.random.default_rng(0), (
-        cfg.batch_size, cfg.batch_length)
+    device, rng = torch.device(cfg.device), np.random.default_rng(0)
+    shape = cfg.batch_size, cfg.batch_length
     teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
     with contextlib.closing(config_env(cfg, cfg.dst, "train")) as env:
         agent = Agent(cfg, env.action_space.shape[0], device, teacher)
@@ -1663,17 +1471,14 @@ def bench(cfg):
     batch["action"] = rng.uniform(-1, 1, (*shape, agent.action_dim)).astype(np.float32)
     times["pretrain step"] = median_ms(lambda: VideoTrainer(cfg, None, device).update(videos))
     times["train step"] = median_ms(lambda: agent.update(batch, cfg.eta, 1))
-    print(f"{cfg.dst}, batch {shape[0]} × {shape[1]}, {cfg.device}, {cfg.precision}, "
-          f"{torch.get_num_threads()} threads")
-    for name, count in parameter_counts(agent).items():
-        print(f"  {name:14}{count:>11,} parameters")
-    for name, value in times.items():
-        print(f"  {name:14}{value:>11.1f} ms")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"  {'peak memory':14}{peak:>11.0f} MiB")
+    print(f"{cfg.dst}, batch {shape[0]} × {shape[1]}, {cfg.device}, {cfg.precision}, "
+          f"{torch.get_num_threads()} threads",
+          *(f"{name:14}{count:>11,} parameters" for name, count in parameter_counts(agent).items()),
+          *(f"{name:14}{value:>11.1f} ms" for name, value in times.items()),
+          f"{'peak memory':14}{peak:>11.0f} MiB", sep="\n  ")
 
 # === Command line =================================================================================
-
 COMMANDS = dict(
     collect="learn in the distracting source task; the replay is the video set",
     pretrain="train the β-VAE video predictor (collects videos first if there are none)",
@@ -1688,14 +1493,12 @@ class Parser(argparse.ArgumentParser):
     """argparse whose errors are one line; that of an unknown flag lists what exists."""
 
     def error(self, message):
-        """Exit 2."""
-        flags = " ".join(action.option_strings[0] for action in self._actions[1:]
-                         if action.option_strings)
+        flags = " ".join(a.option_strings[0] for a in self._actions[1:] if a.option_strings)
         hint = f"there are: {flags}" if "unrecognized" in message else f"see: {self.prog} --help"
         self.exit(2, f"error: {message}; {hint}\n")
 
-def number(kind, low):
-    """A parser of numbers of a type that are finite and at least `low`."""
+def number(kind, low):  # a parser of numbers of a type that are finite and at least `low`
+
     def parse(text):
         if not low <= kind(text) < math.inf:
             raise argparse.ArgumentTypeError(f"{text} is not a number from {low} up")
@@ -1721,8 +1524,7 @@ def parse_args(argv):
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, help in COMMANDS.items():
         sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
-        sub.add_argument("--preset", choices=PRESETS, help="all sizes; default: paper on CUDA, "
-                         "else small")
+        sub.add_argument("--preset", choices=PRESETS, help="default: paper on CUDA, else small")
         sub.add_argument("--fresh", action="store_true", help="start over instead of resuming")
         if name in ("evaluate", "traverse"):
             sub.add_argument("--run", required=True, help="folder of a run: runs/…/seed0")
@@ -1744,10 +1546,9 @@ def parse_args(argv):
 
 def prepare_machine(cfg):
     """Decide what is "auto", and set torch up. Returns the Config with the decisions."""
-    device = cfg.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    if device == "cuda" and not torch.cuda.is_available():
+    gpu = torch.cuda.is_available()
+    device = cfg.device if cfg.device != "auto" else "cuda" if gpu else "cpu"
+    if device == "cuda" and not gpu:
         raise UserError("there is no CUDA device; use --device cpu")
     cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     native = device == "cuda" or "avx512_bf16" in cpuinfo or "amx_bf16" in cpuinfo
@@ -1761,7 +1562,6 @@ def prepare_machine(cfg):
     return replace(cfg, device=device, precision=precision)
 
 def run_command(argv):
-    """Parse a command line and carry it out."""
     args, cfg = parse_args(argv)
     cfg, command = prepare_machine(cfg), globals()[args.command]
     if command in (collect, pretrain, finetune):
@@ -1769,8 +1569,8 @@ def run_command(argv):
     elif command in (evaluate, traverse):
         command(args.run, torch.device(cfg.device))
     elif command is plot:
-        plot(args.run or sorted(Path(cfg.runs).glob("finetune/*/*/seed*")),
-             args.out or Path(cfg.runs) / "curves.png")
+        runs = Path(cfg.runs)
+        plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")
     else:
         command(cfg)
 

@@ -8,8 +8,8 @@ CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")"
 export MUJOCO_GL=${MUJOCO_GL:-egl}
 
 # The small preset, cut down until all of it fits into 15 minutes on two CPU cores.
-tour=(--preset small --collect-steps 6000 --pretrain-updates 300 --steps 10000 --prefill 1000
-      --eval-every 2500 --eval-episodes 3)
+tour=(--preset small --collect-steps 4000 --pretrain-updates 200 --steps 8000 --prefill 1000
+      --eval-every 4000 --eval-episodes 3)
 
 usage() {
     cat <<'EOF'

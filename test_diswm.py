@@ -1,0 +1,2159 @@
+"""The specification of DisWM: read the test names from top to bottom.
+
+Each docstring says which equation a test checks, or which real bug of the published code it kills.
+Oracles are independent of `diswm.py`: torch.distributions, numpy loops, Monte Carlo, derivatives by
+hand. Properties that a planted bug must break live in plain `check_…` functions, which reach the
+production code through the module.
+"""
+
+import contextlib
+import dataclasses
+import errno
+import functools
+import io
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from torch.distributions import Categorical, Normal, kl_divergence
+
+import diswm
+from diswm import METHODS, PRESETS, TASKS, AgentTrainer, Replay, UserError, make_env, make_row
+
+settings.register_profile(
+    "diswm", max_examples=15, deadline=None, derandomize=bool(os.environ.get("CI")),
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+settings.load_profile("diswm")
+torch.set_num_threads(1)
+
+slow = pytest.mark.slow
+PAPER_TASKS = ("walker_walk", "cheetah_run", "hopper_stand", "finger_spin", "cartpole_swingup",
+               "reacher_easy", "humanoid_walk")
+CPU = torch.device("cpu")
+seeds = st.integers(0, 2**31 - 1)
+sizes = st.integers(1, 5)
+
+
+def tiny_config(method="diswm", **changes):
+    """The debug preset in fp32 on the CPU, as the method, with some values changed."""
+    values = dict(precision="fp32", device="cpu", method=method) | METHODS[method] | changes
+    return dataclasses.replace(PRESETS["debug"], **values)
+
+
+def fake_batch(batch=3, length=8, action_dim=2, seed=0):
+    """A numpy batch of noise in the replay's format, with a seam where it is long enough."""
+    rng = np.random.default_rng(seed)
+    first = np.zeros((batch, length), bool)
+    first[:, 0] = True
+    if length >= 4:
+        first[0, length // 2] = True
+    terminal = np.zeros_like(first)
+    terminal[:, :-1] = first[:, 1:]
+    return dict(
+        image=rng.integers(0, 256, (batch, length, 64, 64, 3), np.uint8),
+        action=rng.uniform(-1, 1, (batch, length, action_dim)).astype(np.float32),
+        reward=rng.normal(size=(batch, length)).astype(np.float32),
+        discount=1 - terminal.astype(np.float32), is_first=first, is_terminal=terminal)
+
+
+def make_agent(cfg, action_dim=2, seed=0):
+    """An agent with a random frozen teacher if its method distils."""
+    torch.manual_seed(seed)
+    distils = cfg.eta > 0 and cfg.encoder == "beta_vae"
+    teacher = diswm.freeze(diswm.BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth)) if distils else None
+    return diswm.Agent(cfg, action_dim, CPU, teacher)
+
+
+def snapshot(module):
+    """Copies of all weights."""
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def same(module, weights):
+    """Whether all weights are still those of the snapshot, bit for bit."""
+    return all(torch.equal(value, weights[name]) for name, value in module.state_dict().items())
+
+
+def randn(seed, *shape):
+    """float64 standard-normal numbers."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def leaf(x):
+    """A copy that collects a gradient."""
+    return x.detach().clone().requires_grad_()
+
+
+def gaussian(seed, *shape):
+    """A float64 diagonal normal as the RSSM has them: mean and std, which collect gradients."""
+    std = 0.1 + 2 * torch.sigmoid(randn(seed + 1, *shape))
+    return dict(mean=leaf(randn(seed, *shape)), std=leaf(std))
+
+
+def run_cli(*argv):
+    """Run a command in this process → (exit code, stdout, stderr)."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = diswm.main([str(arg) for arg in argv])
+        except SystemExit as stop:  # argparse
+            code = stop.code
+    return code, out.getvalue(), err.getvalue()
+
+
+def succeed(*argv):
+    """Run a command that must work, and say nothing on stderr. Returns stdout."""
+    code, out, err = run_cli(*argv)
+    assert (code, err) == (0, "")
+    return out
+
+
+def refuse(*argv, code=1, says=""):
+    """Run a command that must fail with exactly one line that names the cause. Returns the line."""
+    result, _, err = run_cli(*argv)
+    assert result == code and err.startswith("error: ") and err.count("\n") == 1, err
+    for text in [says] if isinstance(says, str) else says:
+        assert text in err, f"{text!r} is not in {err!r}"
+    return err
+
+
+DEBUG = ("--preset", "debug", "--device", "cpu", "--precision", "fp32")
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory):
+    """A folder in which collect and pretrain (debug) are finished: runs/ with one teacher."""
+    folder = tmp_path_factory.mktemp("root")
+    succeed("pretrain", "--src", "cheetah_run", "--runs", folder / "runs", *DEBUG)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def teacher(root):
+    """The finished teacher's checkpoint."""
+    return root / "runs/pretrain/cheetah_run/diswm/seed0/checkpoint.pt"
+
+
+@pytest.fixture(scope="session")
+def finished(root):
+    """The run folder of a finetuning that went through without interruption."""
+    succeed("finetune", "--dst", "walker_walk", "--runs", root / "runs", *DEBUG)
+    return root / "runs/finetune/cheetah_run-walker_walk/diswm/seed0"
+
+
+# === KL and distributions =========================================================================
+
+def torch_kl(q, p):
+    """KL[q || p] summed over the last dimension, by torch.distributions."""
+    return kl_divergence(Normal(q["mean"], q["std"]), Normal(p["mean"], p["std"])).sum(-1)
+
+
+@given(seeds, sizes, sizes)
+def test_gaussian_kl_equals_torch_distributions_and_is_never_negative(seed, n, dims):
+    """The closed form behind Eqs. (2), (5); an exchanged p and q would show."""
+    q, p = gaussian(seed, n, dims), gaussian(seed + 9, n, dims)
+    value = diswm.gaussian_kl(q["mean"], q["std"], p["mean"], p["std"])
+    torch.testing.assert_close(value.sum(-1), torch_kl(q, p))
+    assert (value >= -1e-12).all()
+
+
+def test_gaussian_kl_equals_a_monte_carlo_average():
+    """KL = E_q[ln q − ln p], within five standard errors."""
+    q, p = Normal(0.7, 0.6), Normal(-0.4, 1.3)
+    torch.manual_seed(0)
+    x = q.sample((200_000,))
+    gap = (q.log_prob(x) - p.log_prob(x)).double()
+    value = float(diswm.gaussian_kl(q.mean, q.stddev, p.mean, p.stddev))
+    assert abs(gap.mean() - value) < 5 * gap.std() / len(gap) ** 0.5
+
+
+@given(seeds, sizes, sizes)
+def test_beta_vae_kl_is_the_kl_to_the_standard_normal_and_additive_over_dims(seed, n, dims):
+    """The disentanglement term of Eqs. (2), (5): a sum over Z, not a mean."""
+    mean, logvar = randn(seed, n, dims), randn(seed + 1, n, dims)
+    value = diswm.beta_vae_kl(mean, logvar)
+    oracle = kl_divergence(Normal(mean, (logvar / 2).exp()), Normal(0.0, 1.0)).sum(-1)
+    torch.testing.assert_close(value, oracle)
+    assert (value >= 0).all()
+    torch.testing.assert_close(diswm.beta_vae_kl(mean.tile(3), logvar.tile(3)), 3 * oracle)
+
+
+def test_beta_vae_kl_is_exactly_zero_at_the_standard_normal():
+    """The published code leaves a stray 1e-6 there."""
+    assert (diswm.beta_vae_kl(torch.zeros(4, 20), torch.zeros(4, 20)) == 0).all()
+
+
+def test_the_maths_passes_gradcheck():
+    """Finite differences in float64 for every differentiable formula."""
+    q, p = gaussian(0, 3, 2), gaussian(5, 3, 2)
+    torch.autograd.gradcheck(diswm.gaussian_kl, (q["mean"], q["std"], p["mean"], p["std"]))
+    torch.autograd.gradcheck(diswm.beta_vae_kl, (q["mean"], p["mean"]))
+    torch.autograd.gradcheck(diswm.normal_log_prob, (q["mean"], p["mean"], p["std"]))
+    torch.autograd.gradcheck(diswm.normal_entropy, (q["std"],))
+    teacher = randn(3, 2, 3, 4)
+    torch.autograd.gradcheck(
+        lambda z: diswm.distillation_loss(teacher, z), (leaf(randn(4, 2, 3, 4)),))
+    torch.autograd.gradcheck(diswm.lambda_return, tuple(leaf(x) for x in returns_problem(0, 4)))
+
+
+def test_log_prob_and_entropy_equal_torch_distributions():
+    """ln π(a | s) and the entropy of the actor's loss, summed over the action."""
+    d, x = gaussian(2, 5, 3), randn(7, 5, 3)
+    normal = Normal(d["mean"], d["std"])
+    log_prob = diswm.normal_log_prob(x, d["mean"], d["std"])
+    torch.testing.assert_close(log_prob, normal.log_prob(x).sum(-1))
+    torch.testing.assert_close(diswm.normal_entropy(d["std"]), normal.entropy().sum(-1))
+
+
+def test_samples_have_their_moments_and_the_derivatives_of_a_reparameterised_draw():
+    """dx/dμ = 1, dx/dσ = (x − μ)/σ, and so ∇E[x²] = (2μ, 2σ)."""
+    torch.manual_seed(0)
+    mean = torch.full((200_000,), 0.7, dtype=torch.float64, requires_grad=True)
+    std = torch.full((200_000,), 1.3, dtype=torch.float64, requires_grad=True)
+    x = diswm.gaussian_sample(mean, std)
+    by_mean, by_std = torch.autograd.grad(x.sum(), (mean, std), retain_graph=True)
+    torch.testing.assert_close(by_mean, torch.ones_like(x))
+    torch.testing.assert_close(by_std, ((x - mean) / std).detach())
+    assert x.mean().item() == pytest.approx(0.7, abs=0.02)
+    assert x.std().item() == pytest.approx(1.3, abs=0.02)
+    by_mean, by_std = torch.autograd.grad((x**2).sum(), (mean, std))
+    assert by_mean.mean().item() == pytest.approx(1.4, abs=0.04)
+    assert by_std.mean().item() == pytest.approx(2.6, abs=0.04)
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=9))
+def test_clipped_actions_stay_in_bounds_and_keep_their_gradient(values):
+    """Straight-through: a plain clamp would leave a saturated actor without a gradient."""
+    action = torch.tensor(values, requires_grad=True)
+    clipped = diswm.clip_action(action)
+    assert (clipped.abs() < 1).all()
+    inside = action.abs() < 0.999
+    torch.testing.assert_close(clipped[inside], action[inside])
+    assert torch.equal(torch.autograd.grad(clipped.sum(), action)[0], torch.ones(len(values)))
+
+
+def check_actions_stay_inside_the_bounds():
+    """Neither acted nor imagined actions leave (−1, 1)."""
+    agent = make_agent(tiny_config(horizon=5))
+    images = fake_batch(batch=1, length=32)["image"][0]
+    action, _ = agent.act(images, np.zeros((32, 2), np.float32), None, explore=True)
+    assert action.shape == (32, 2) and (np.abs(action) < 1).all()
+    rssm, seen = agent.model.rssm, []
+    recur = rssm.recur
+    rssm.recur = lambda state, action: seen.append(action.detach()) or recur(state, action)
+    agent.behaviour.imagine(agent.model, rssm.initial(32))
+    assert len(seen) == 5 and (torch.stack(seen).abs() < 1).all()
+
+
+def test_acted_and_imagined_actions_stay_inside_the_bounds():
+    """The published "truncated" normal is not truncated: its actions leave [−1, 1]."""
+    check_actions_stay_inside_the_bounds()
+
+
+def test_evaluation_takes_the_actors_mode():
+    """Mode = tanh(m), the policy's mean, without noise."""
+    agent, zeros = make_agent(tiny_config()), np.zeros((4, 2), np.float32)
+    images = fake_batch(batch=1, length=4)["image"][0]
+    action, state = agent.act(images, zeros, None, explore=False)
+    mean, _ = agent.behaviour.policy(agent.model.rssm.feat(state))
+    np.testing.assert_allclose(action, mean.detach().numpy(), atol=1e-6)
+    assert not np.allclose(action, agent.act(images, zeros, None, explore=True)[0])
+
+
+# === KL balancing and free nats ===================================================================
+
+@given(seeds, sizes, sizes, st.floats(0, 1), st.floats(0, 3))
+def test_kl_value_is_the_plain_kl_per_step(seed, batch, length, balance, free_nats):
+    """Neither balance nor free nats touch the (B, T) value that is logged."""
+    post, prior = gaussian(seed, batch, length, 3), gaussian(seed + 9, batch, length, 3)
+    loss, value = diswm.rssm_kl_loss(post, prior, balance, free_nats)
+    torch.testing.assert_close(value, torch_kl(post, prior))
+    assert loss.item() == pytest.approx(max(value.mean().item(), free_nats))
+
+
+def check_kl_gradient_is_split(seed=0, balance=0.8):
+    """Prior side: balance × the plain KL's gradient; posterior side: (1 − balance) ×."""
+    post, prior = gaussian(seed, 2, 3, 4), gaussian(seed + 9, 2, 3, 4)
+    leaves = [*post.values(), *prior.values()]
+    plain = torch.autograd.grad(torch_kl(post, prior).mean(), leaves)
+    split = torch.autograd.grad(diswm.rssm_kl_loss(post, prior, balance, 0.0)[0], leaves)
+    for got, whole, share in zip(split, plain, [1 - balance] * 2 + [balance] * 2, strict=True):
+        torch.testing.assert_close(got, share * whole)
+
+
+@given(seeds, st.sampled_from([0.0, 0.2, 0.5, 0.8, 1.0]))
+def test_kl_gradient_is_split_balance_to_the_prior_and_the_rest_to_the_posterior(seed, balance):
+    """DreamerV2's KL balancing, the right way round; 0 and 1 silence one side."""
+    check_kl_gradient_is_split(seed, balance)
+
+
+@given(seeds, st.floats(0.01, 2))
+def test_below_the_free_nats_the_kl_loss_is_constant_with_zero_gradient(seed, margin):
+    """loss = free nats exactly, and nothing is trained."""
+    post, prior = gaussian(seed, 2, 3, 4), gaussian(seed + 9, 2, 3, 4)
+    free_nats = torch_kl(post, prior).mean().item() + margin
+    loss, _ = diswm.rssm_kl_loss(post, prior, 0.8, free_nats)
+    assert loss.item() == pytest.approx(free_nats)
+    for grad in torch.autograd.grad(loss, [*post.values(), *prior.values()], allow_unused=True):
+        assert grad is None or not grad.any()
+
+
+def check_free_nats_act_on_the_mean():
+    """Steps of 0.1 and 3.0 nats with 1 free nat: 1.55, not (1 + 3) / 2."""
+    mean = (2 * torch.tensor([[[0.1], [3.0]]])).sqrt()  # KL = μ² / 2
+    post, prior = dict(mean=mean, std=mean * 0 + 1), dict(mean=mean * 0, std=mean * 0 + 1)
+    loss, value = diswm.rssm_kl_loss(post, prior, free_nats=1.0)
+    torch.testing.assert_close(value, torch.tensor([[0.1, 3.0]]))
+    assert loss.item() == pytest.approx(1.55)
+
+
+def test_free_nats_act_on_the_mean_not_on_each_step():
+    """As published: [0.1, 3.0] nats give 1.55, not 2.0."""
+    check_free_nats_act_on_the_mean()
+
+
+# === Distillation =================================================================================
+
+def check_distillation_is_equation_3(seed=0, batch=2, length=3, dims=5):
+    """Σ_t mean_B KL(softmax teacher || softmax task); its gradient is (p_task − p_teacher) / B."""
+    teacher, task = (leaf(randn(seed + i, batch, length, dims)) for i in range(2))
+    loss = diswm.distillation_loss(teacher, task)
+    oracle = kl_divergence(Categorical(logits=teacher), Categorical(logits=task)).sum(1).mean(0)
+    assert loss.shape == () and loss.item() >= -1e-12
+    torch.testing.assert_close(loss, oracle)
+    grad, = torch.autograd.grad(loss, task)
+    torch.testing.assert_close(grad, (task.softmax(-1) - teacher.softmax(-1)).detach() / batch)
+
+
+@given(seeds, sizes, sizes, st.integers(1, 20))
+def test_distillation_is_equation_3_summed_over_time_and_averaged_over_the_batch(
+        seed, batch, length, dims):
+    """Eq. (3) against torch's Categorical, its direction and its analytic gradient included."""
+    check_distillation_is_equation_3(seed, batch, length, dims)
+
+
+@given(seeds, st.floats(-50, 50))
+def test_distillation_is_zero_exactly_for_latents_equal_up_to_a_constant(seed, shift):
+    """Softmax forgets a shift of all dimensions, and nothing else."""
+    z, noise = randn(seed, 2, 3, 5), randn(seed + 1, 2, 3, 5)
+    assert diswm.distillation_loss(z, z + shift).item() == pytest.approx(0, abs=1e-10)
+    assert diswm.distillation_loss(z + shift, z).item() == pytest.approx(0, abs=1e-10)
+    assert diswm.distillation_loss(z, z + noise).item() > 1e-4
+
+
+@given(seeds, st.permutations(range(5)))
+def test_distillation_ignores_a_common_permutation_of_the_latents_but_not_of_one_side(seed, order):
+    """The latents are compared dimension by dimension."""
+    teacher, task = randn(seed, 2, 3, 5), randn(seed + 1, 2, 3, 5)
+    both = diswm.distillation_loss(teacher[..., order], task[..., order])
+    torch.testing.assert_close(both, diswm.distillation_loss(teacher, task))
+    if list(order) != sorted(order):
+        assert diswm.distillation_loss(teacher, teacher[..., order]).item() > 1e-9
+
+
+def check_distillation_scale(name="distillation_loss", seed=0, times=4):
+    """Twice the time, twice the loss; twice the batch, the same loss."""
+    def value(repeat_batch, repeat_time):
+        sides = [randn(seed + i, 2, 3, 5).repeat(repeat_batch, repeat_time, 1) for i in range(4)]
+        if name == "distillation_loss":
+            return diswm.distillation_loss(*sides[:2])
+        keys = ("mean", "logvar")
+        return getattr(diswm, name)(*(dict(zip(keys, pair, strict=True))
+                                      for pair in (sides[:2], sides[2:])))
+    torch.testing.assert_close(value(1, times), times * value(1, 1))
+    torch.testing.assert_close(value(times, 1), value(1, 1))
+
+
+@pytest.mark.parametrize("name", ["distillation_loss", "gaussian_distillation_loss"])
+@given(seeds, st.integers(2, 5))
+def test_distillation_is_proportional_to_time_and_independent_of_the_batch_size(name, seed, times):
+    """The scale at which the paper's η = 0.1 was tuned ("batchmean" on (B, T, Z))."""
+    check_distillation_scale(name, seed, times)
+
+
+def test_gaussian_distillation_is_the_kl_from_the_teachers_posterior():
+    """`--distill gaussian`: closed form against torch.distributions, teacher first."""
+    teacher, task = (dict(mean=randn(i, 2, 3, 5), logvar=randn(i + 1, 2, 3, 5)) for i in (0, 5))
+    p, q = (dict(mean=d["mean"], std=(d["logvar"] / 2).exp()) for d in (teacher, task))
+    loss = diswm.gaussian_distillation_loss(teacher, task)
+    torch.testing.assert_close(loss, torch_kl(p, q).sum(1).mean(0))
+
+
+def check_no_gradient_reaches_the_teacher():
+    """Backward through either distillation loss leaves the teacher's latents without a gradient."""
+    z_disen, z_task = leaf(randn(0, 2, 3, 5)), leaf(randn(1, 2, 3, 5))
+    diswm.distillation_loss(z_disen, z_task).backward()
+    codes = [{k: leaf(randn(i, 2, 3, 5)) for k in ("mean", "logvar")} for i in (2, 3)]
+    diswm.gaussian_distillation_loss(*codes).backward()
+    for fixed in (z_disen, *codes[0].values()):
+        assert fixed.grad is None or not fixed.grad.any()
+    for trained in (z_task, *codes[1].values()):
+        assert trained.grad.any()
+
+
+def test_no_gradient_reaches_the_teachers_latents():
+    """The teacher is a fixed target (section 3.3); the student gets the gradient."""
+    check_no_gradient_reaches_the_teacher()
+
+
+def check_teacher_is_frozen():
+    """Same bytes after three updates, evaluation mode, no gradients, in no optimiser."""
+    agent = make_agent(tiny_config())
+    before, student = snapshot(agent.teacher), snapshot(agent.model.encoder)
+    for update in range(3):
+        metrics = agent.update(fake_batch(seed=update), 0.6, update)
+    assert metrics["distill"] > 0 and not same(agent.model.encoder, student)
+    assert same(agent.teacher, before)
+    assert not agent.teacher.training
+    assert all(p.grad is None and not p.requires_grad for p in agent.teacher.parameters())
+    trained = {id(p) for optimizer in agent.optimizers.values()
+               for group in optimizer.param_groups for p in group["params"]}
+    assert not trained & {id(p) for p in agent.teacher.parameters()}
+
+
+def test_teacher_bytes_are_unchanged_by_updates_and_in_no_optimiser():
+    """The published code switches the teacher's gradients back on and trains it along."""
+    check_teacher_is_frozen()
+
+
+@given(st.floats(0.01, 1), st.floats(0.0, 1), st.integers(10, 10**5), st.integers(0, 10**5))
+def test_eta_is_zero_before_its_delay_then_falls_to_its_exact_end(start, share, decay, delay):
+    """Section 3.4: 0 before the delay, start at it, never rising, resting exactly at the end."""
+    end = start * share
+    eta = [diswm.eta_schedule(delay + k * decay // 20, start, end, decay, delay) for k in range(60)]
+    assert eta[0] == start and eta[-1] == end == eta[20]
+    assert all(b <= a for a, b in zip(eta, eta[1:], strict=False))
+    assert delay == 0 or diswm.eta_schedule(delay - 1, start, end, decay, delay) == 0
+    half = diswm.eta_schedule(delay + decay // 2, start, 0.0, decay, delay)
+    assert half == pytest.approx(start * (1 - (decay // 2) / decay))
+
+
+@pytest.mark.parametrize("step, eta", [
+    (0, 0.1), (10_000, 0.08), (25_000, 0.05), (45_000, 0.01), (10**6, 0.01)])
+def test_eta_has_the_papers_values(step, eta):
+    """From 0.1 to 0.01 in 45 000 decisions."""
+    assert diswm.eta_schedule(step) == pytest.approx(eta, abs=1e-12)
+
+
+class FakeEnv(gym.Env):
+    """Noise for ten decisions of two env steps each; counts its decisions."""
+
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    observation_space = gym.spaces.Box(0, 255, (64, 64, 3), np.uint8)
+    count = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.integers(0, 256, (64, 64, 3), np.uint8), {}
+
+    def step(self, action):
+        self.count += 1
+        image = self.np_random.integers(0, 256, (64, 64, 3), np.uint8)
+        return image, 1.0, False, self.count % 10 == 0, dict(env_steps=2)
+
+
+def check_eta_falls_during_a_run(delay=0):
+    """In a real training loop every update sees η of the decisions so far, prefill included."""
+    cfg = tiny_config(steps=120, prefill=10, train_every=5, eta=0.6, eta_end=0.06, eta_decay=40,
+                      eta_delay=delay, eval_every=10**6, eval_episodes=1)
+    envs, seen, update = [], [], diswm.Agent.update
+
+    def spy(self, *args, **kwargs):
+        metrics = update(self, *args, **kwargs)
+        seen.append((max(env.count for env in envs), metrics["eta"].item()))
+        return metrics
+
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        patch.setattr(diswm, "make_env", lambda *a, **k: envs.append(FakeEnv()) or envs[-1])
+        patch.setattr(diswm.Agent, "update", spy)
+        teacher = diswm.freeze(diswm.BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth))
+        trainer = diswm.AgentTrainer(cfg, Path(folder), CPU, teacher)
+        while trainer.progress < trainer.total:
+            trainer.advance()
+    assert len(seen) > 8
+    for decisions, eta in seen:
+        live = 0.0 if decisions < delay else max(0.6 * (1 - (decisions - delay) / 40), 0.06)
+        assert eta == pytest.approx(live)
+    assert len({eta for _, eta in seen}) > 4
+
+
+@pytest.mark.parametrize("delay", [0, 25])
+def test_eta_differs_between_the_updates_of_a_live_run(delay):
+    """The published code copies the step once: η stays at 0.095, across domains at 0."""
+    check_eta_falls_during_a_run(delay)
+
+
+# === Returns and actor-critic =====================================================================
+
+def returns_problem(seed, horizon, *batch):
+    """Random reward, value, discount (H, ...) in [0, 1), bootstrap (...)."""
+    return (randn(seed, horizon, *batch), randn(seed + 1, horizon, *batch),
+            torch.sigmoid(randn(seed + 2, horizon, *batch)), randn(seed + 3, *batch))
+
+
+def n_step_mixture(reward, value, discount, bootstrap, lambda_):
+    """The slow oracle: every n-step return of every t, mixed with weights (1 − λ) λ^(n − 1)."""
+    reward, value, discount, bootstrap = (x.detach().double().numpy() for x in
+                                          (reward, value, discount, bootstrap))
+    values, horizon = [*value, bootstrap], len(reward)
+    returns = np.zeros_like(reward)
+    for t in range(horizon):
+        total, gamma = np.zeros_like(bootstrap), np.ones_like(bootstrap)
+        for n in range(1, horizon - t + 1):
+            total = total + gamma * reward[t + n - 1]
+            gamma = gamma * discount[t + n - 1]
+            weight = (1 - lambda_) * lambda_ ** (n - 1) if t + n < horizon else lambda_ ** (n - 1)
+            returns[t] += weight * (total + gamma * values[t + n])
+    return returns
+
+
+def check_lambda_return_is_the_n_step_mixture(seed=0, horizon=5, n=3, lambda_=0.95):
+    """lambda_return against the slow oracle."""
+    problem = returns_problem(seed, horizon, n)
+    result = diswm.lambda_return(*problem, lambda_)
+    assert result.shape == (horizon, n)
+    np.testing.assert_allclose(result.numpy(), n_step_mixture(*problem, lambda_), atol=1e-9)
+
+
+@given(seeds, st.integers(1, 8), sizes, st.floats(0, 1))
+def test_lambda_return_is_the_mixture_of_all_n_step_returns_in_time_order(seed, horizon, n, l):
+    """Appendix B; the published λ-return comes out reversed in time."""
+    check_lambda_return_is_the_n_step_mixture(seed, horizon, n, l)
+
+
+def test_lambda_zero_is_the_one_step_target_and_lambda_one_the_discounted_sum():
+    """By hand: r = 1, 2, 3; γ = ½; v = 10, 20, 40 and 80 behind them."""
+    reward, value = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([10.0, 20.0, 40.0])
+    problem = reward, value, torch.full((3,), 0.5), torch.tensor(80.0)
+    assert diswm.lambda_return(*problem, 0.0).tolist() == [11.0, 22.0, 43.0]
+    assert diswm.lambda_return(*problem, 1.0).tolist() == [12.75, 23.5, 43.0]
+
+
+@given(seeds, st.floats(-3, 3))
+def test_lambda_return_is_linear_in_rewards_and_values(seed, scale):
+    """V(x + c y) = V(x) + c V(y) for the same discounts."""
+    r, v, discount, b = returns_problem(seed, 5, 2)
+    r2, v2, _, b2 = returns_problem(seed + 9, 5, 2)
+    whole = diswm.lambda_return(r + scale * r2, v + scale * v2, discount, b + scale * b2)
+    one, two = diswm.lambda_return(r, v, discount, b), diswm.lambda_return(r2, v2, discount, b2)
+    torch.testing.assert_close(whole, one + scale * two)
+
+
+@given(st.floats(-5, 5), st.floats(0, 0.99), st.floats(0, 1), st.integers(1, 15))
+def test_constant_reward_has_its_discounted_sum_as_fixed_point(reward, gamma, lambda_, horizon):
+    """r, γ constant and v = r / (1 − γ) everywhere: every V is that too."""
+    value = torch.full((horizon,), reward / (1 - gamma), dtype=torch.float64)
+    ones = torch.ones_like(value)
+    result = diswm.lambda_return(reward * ones, value, gamma * ones, value[0], lambda_)
+    torch.testing.assert_close(result, value)
+
+
+@given(seeds, st.integers(0, 4))
+def test_a_zero_discount_cuts_the_future(seed, end):
+    """γ_k = 0: up to k no return knows what comes after, and V_k = r_k."""
+    reward, value, discount, bootstrap = returns_problem(seed, 5, 2)
+    discount[end] = 0
+    result = diswm.lambda_return(reward, value, discount, bootstrap)
+    torch.testing.assert_close(result[end], reward[end])
+    reward[end + 1:], value[end + 1:], bootstrap = 1e3, -1e3, bootstrap + 1e3
+    changed = diswm.lambda_return(reward, value, discount, bootstrap)
+    torch.testing.assert_close(changed[: end + 1], result[: end + 1])
+
+
+def stubbed_behaviour(seed, horizon=4, **changes):
+    """World model and actor-critic whose imagination is a given tensor; the slow critic differs."""
+    cfg = tiny_config(horizon=horizon, entropy_scale=0.3, **changes)
+    torch.manual_seed(seed)
+    model, behaviour = diswm.WorldModel(cfg, 2), diswm.ActorCritic(cfg, 2)
+    with torch.no_grad():
+        for weights in behaviour.slow_critic.parameters():
+            weights.add_(0.3 * torch.randn_like(weights))
+    feats = leaf(3 * torch.randn(horizon + 1, 3, cfg.stoch + cfg.deter))
+    log_prob, entropy = leaf(torch.randn(horizon, 3)), leaf(torch.randn(horizon, 3))
+    behaviour.imagine = lambda *args: (feats, log_prob, entropy)
+    return model, behaviour, feats, log_prob, entropy
+
+
+def check_behaviour_losses_are_appendix_b(seed=0, rho=0.6):
+    """Both losses against loops: targets of the slow critic, weights Π γ, true first discount."""
+    model, behaviour, feats, log_prob, entropy = stubbed_behaviour(seed, rho=rho)
+    first = 0.99 * torch.tensor([1.0, 0.0, 1.0])
+    actor, critic, _ = behaviour.losses(model, model.rssm.initial(3), first)
+    with torch.no_grad():
+        reward, gamma = model.predict_reward(feats), torch.sigmoid(model.predict_discount(feats))
+        gamma[0] = first
+        slow, online = behaviour.value(feats, slow=True), behaviour.value(feats).numpy()
+    target = n_step_mixture(reward[:-1], slow[:-1], gamma[:-1], slow[-1], behaviour.cfg.lambda_)
+    actor_sum = critic_sum = 0.0
+    for n in range(3):
+        weight = 1.0
+        for t in range(4):
+            advantage = target[t, n] - online[t, n]
+            critic_sum += weight * 0.5 * advantage**2
+            actor_sum -= weight * (rho * target[t, n] + 0.3 * entropy[t, n].item()
+                                   + (1 - rho) * log_prob[t, n].item() * advantage)
+            weight *= gamma[t, n].item()
+    assert critic.item() == pytest.approx(critic_sum / 12, rel=1e-4, abs=1e-6)
+    assert actor.item() == pytest.approx(actor_sum / 12, rel=1e-4, abs=1e-6)
+
+
+@given(seeds, st.floats(0, 1))
+def test_actor_and_critic_losses_are_those_of_appendix_b(seed, rho):
+    """ρ V + (1 − ρ) ln π · sg(V − v) + entropy; ½ (V − v)²; both weighted by Π γ."""
+    check_behaviour_losses_are_appendix_b(seed, rho)
+
+
+@pytest.mark.parametrize("rho", [0.0, 1.0])
+def test_rho_chooses_between_dynamics_backprop_and_reinforce(rho):
+    """ρ = 1: the actor's gradient comes along the states; ρ = 0: along ln π only."""
+    model, behaviour, feats, log_prob, _ = stubbed_behaviour(0, rho=rho)
+    actor, critic, _ = behaviour.losses(model, model.rssm.initial(3), torch.full((3,), 0.99))
+    by_state, by_log_prob = torch.autograd.grad(actor, (feats, log_prob), allow_unused=True,
+                                                retain_graph=True)
+    assert (by_state is not None and by_state.any().item()) == (rho == 1)
+    assert (by_log_prob is not None and by_log_prob.any().item()) == (rho == 0)
+    assert torch.autograd.grad(critic, feats, allow_unused=True)[0] is None
+
+
+def test_dynamics_gradient_reaches_the_actor_through_imagined_states():
+    """With ρ = 1 and no entropy bonus, the only path is action → state → reward and value."""
+    agent = make_agent(tiny_config(rho=1.0, entropy_scale=0.0))
+    start = agent.model.rssm.initial(4)
+    loss, _, _ = agent.behaviour.losses(agent.model, start, torch.full((4,), 0.99))
+    for grad in torch.autograd.grad(loss, list(agent.behaviour.actor.parameters())):
+        assert grad.any()
+
+
+def test_imagination_starts_at_the_given_states_and_makes_horizon_transitions():
+    """States s_0 … s_H, log-probs and entropies of a_0 … a_{H−1}."""
+    agent = make_agent(tiny_config(horizon=4))
+    start = {key: torch.randn_like(x) for key, x in agent.model.rssm.initial(5).items()}
+    feats, log_prob, entropy = agent.behaviour.imagine(agent.model, start)
+    assert len(feats) == 5 and log_prob.shape == entropy.shape == (4, 5)
+    torch.testing.assert_close(feats[0], torch.cat([start["stoch"], start["deter"]], -1))
+
+
+def test_log_prob_trains_the_policy_for_given_states_and_actions():
+    """REINFORCE: states and actions are data; ln π trains the mean and nothing in the model."""
+    agent = make_agent(tiny_config(horizon=4))
+    _, log_prob, entropy = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(5))
+    bias = list(agent.behaviour.actor.parameters())[-1]  # of (mean, std), two numbers each
+    model = list(agent.model.rssm.parameters())
+    grads = torch.autograd.grad(log_prob.sum() + entropy.sum(), [bias, *model], allow_unused=True)
+    assert (grads[0][:2].abs() > 1e-3).all()
+    assert all(grad is None for grad in grads[1:])
+
+
+@pytest.mark.parametrize("still", ["model", "actor", "critic"])
+def test_each_update_changes_its_own_part_and_no_other(still):
+    """With one learning rate at zero that part keeps its bytes, whatever the other losses do."""
+    agent = make_agent(tiny_config(**{f"{still}_lr": 0.0}))
+    parts = dict(model=agent.model, actor=agent.behaviour.actor, critic=agent.behaviour.critic)
+    before = {name: snapshot(part) for name, part in parts.items()}
+    for update in range(2):
+        agent.update(fake_batch(seed=update), 0.6, update)
+    assert {name for name, part in parts.items() if same(part, before[name])} == {still}
+
+
+def test_slow_critic_is_copied_at_update_zero_and_every_slow_every_updates():
+    """Between copies it keeps its bytes while the critic learns; a copy precedes the update."""
+    agent = make_agent(tiny_config(slow_every=3))
+    for update in range(7):
+        if update % 3 == 0:
+            expected = snapshot(agent.behaviour.critic)
+        agent.update(fake_batch(batch=2, length=3, seed=update), 0.6, update)
+        assert same(agent.behaviour.slow_critic, expected)
+        assert not same(agent.behaviour.critic, expected)
+
+
+# === Loss shapes ==================================================================================
+
+def noise_teacher(out, seed=0):
+    """A teacher's latents for the output of a world model."""
+    torch.manual_seed(seed)
+    return {key: torch.randn_like(out["embed"]) for key in ("embed", "mean", "logvar")}
+
+
+@pytest.mark.parametrize("method", METHODS)
+@given(sizes, st.integers(2, 6), sizes, sizes, sizes, sizes)
+def test_terms_are_per_step_and_losses_are_finite_scalars(
+        method, batch, length, action, z, stoch, deter):
+    """For any size: terms (B, T), metrics finite scalars, each term's metric its mean."""
+    cfg = tiny_config(method, z_dim=z, stoch=stoch, deter=deter)
+    data = diswm.to_device(fake_batch(batch, length, action), CPU)
+    video = {key: data[key] for key in ("image", "is_first")}
+    code = {"disentangle"} if cfg.encoder == "beta_vae" else set()
+    for model, rows, heads in ((diswm.VideoPredictor(cfg), video, set()),
+                               (diswm.WorldModel(cfg, action), data, {"reward", "discount"})):
+        out = model(rows)
+        terms = model.terms(out, rows)
+        assert terms.keys() >= {"image"} | code | heads
+        assert all(term.shape == (batch, length) for term in terms.values())
+        loss, metrics = model.loss(out, rows)
+        assert loss.shape == () and loss.isfinite()
+        assert all(value.shape == () and value.isfinite() for value in metrics.values())
+        for name, term in terms.items():
+            torch.testing.assert_close(metrics[name], term.mean())
+
+
+def gets_gradient(modules):
+    """Names of the weights that have a gradient other than zero, and of all weights."""
+    named = {f"{i}.{n}": p for i, part in enumerate(modules) for n, p in part.named_parameters()}
+    return {name for name, p in named.items() if p.grad is not None and p.grad.any()}, set(named)
+
+
+@pytest.mark.parametrize("distill", ["softmax", "gaussian"])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_trainable_parameter_of_its_stage_gets_a_gradient_and_no_other_does(method, distill):
+    """Pretraining trains the whole predictor; an agent's update all but teacher and slow critic."""
+    cfg = tiny_config(method, free_nats=0.0, distill=distill, grad_clip=1e9)
+    agent = make_agent(cfg)
+    metrics, behaviour = agent.update(fake_batch(), cfg.eta, 0), agent.behaviour
+    got, named = gets_gradient([agent.model, behaviour.actor, behaviour.critic])
+    assert got == named
+    norm = torch.stack([p.grad.norm() for p in agent.model.parameters()]).norm()
+    torch.testing.assert_close(norm, metrics["model_grad_norm"])  # none from the behaviour's
+    for fixed in filter(None, [agent.teacher, behaviour.slow_critic]):
+        assert all(p.grad is None for p in fixed.parameters())
+    trainer = diswm.VideoTrainer(cfg, None, CPU)
+    trainer.update({key: fake_batch()[key] for key in ("image", "is_first")})
+    got, named = gets_gradient([trainer.model])
+    assert got == named
+
+
+weights = st.floats(0, 5).map(lambda x: round(x, 3))
+
+
+@given(weights, weights, weights, weights, weights, st.sampled_from(["softmax", "gaussian"]))
+def test_the_world_models_loss_is_the_weighted_sum_of_equation_5(
+        alpha, beta, reward, discount, eta, mode):
+    """Image + α KL + β disentangle + heads + η distill: β = 0, η = 0 remove exactly their terms."""
+    cfg = tiny_config(alpha=alpha, beta=beta, reward_scale=reward, discount_scale=discount,
+                      beta1=7.0, beta2=7.0, distill=mode)
+    torch.manual_seed(0)
+    model, batch = diswm.WorldModel(cfg, 2), diswm.to_device(fake_batch(2, 3), CPU)
+    out = model(batch)
+    teacher = noise_teacher(out)
+    loss, m = model.loss(out, batch, teacher, eta)
+    total = (m["image"] + alpha * m["kl_loss"] + beta * m["disentangle"] + reward * m["reward"]
+             + discount * m["discount"] + eta * m["distill"])
+    torch.testing.assert_close(loss, total)
+    if mode == "softmax":
+        student = Categorical(logits=out["embed"])
+        oracle = kl_divergence(Categorical(logits=teacher["embed"]), student).sum(1).mean()
+        torch.testing.assert_close(m["distill"], oracle)
+
+
+@given(weights, weights)
+def test_the_video_predictors_loss_is_the_weighted_sum_of_equation_2(beta1, beta2):
+    """Image + β₁ KL + β₂ disentangle, with weights of its own."""
+    model = diswm.VideoPredictor(tiny_config(beta1=beta1, beta2=beta2, alpha=7.0, beta=7.0))
+    batch = diswm.to_device({key: fake_batch(2, 3)[key] for key in ("image", "is_first")}, CPU)
+    loss, m = model.loss(model(batch), batch)
+    torch.testing.assert_close(loss, m["image"] + beta1 * m["kl_loss"] + beta2 * m["disentangle"])
+
+
+def test_the_terms_are_the_negative_log_likelihoods_of_equations_4_and_5():
+    """½ squared error over pixels and reward; cross-entropy to the soft target γ (1 − terminal)."""
+    torch.manual_seed(0)
+    model, batch = diswm.WorldModel(tiny_config(), 2), diswm.to_device(fake_batch(2, 4), CPU)
+    out = model(batch)
+    terms = model.terms(out, batch)
+    feat, constant = out["feat"], Normal(0.0, 1.0).log_prob(torch.zeros(()))
+    image = (constant - Normal(model.decoder(feat), 1.0).log_prob(batch["image"])).sum((-3, -2, -1))
+    reward = constant - Normal(model.predict_reward(feat), 1.0).log_prob(batch["reward"])
+    p, target = torch.sigmoid(model.predict_discount(feat)), 0.99 * batch["discount"]
+    entropy = -target * p.log() - (1 - target) * (1 - p).log()
+    std = (out["code"]["logvar"] / 2).exp()
+    disentangle = kl_divergence(Normal(out["code"]["mean"], std), Normal(0.0, 1.0)).sum(-1)
+    oracles = dict(image=image, reward=reward, discount=entropy, disentangle=disentangle)
+    for name, oracle in oracles.items():
+        torch.testing.assert_close(terms[name], oracle, rtol=1e-4, atol=1e-5)
+
+
+# === RSSM =========================================================================================
+
+def window(seed, batch=3, length=6, action_dim=2):
+    """An RSSM and a window: embed, action, is_first."""
+    torch.manual_seed(seed)
+    rssm = diswm.RSSM(action_dim, 4, stoch=3, deter=5, hidden=6).requires_grad_(False)
+    first = torch.zeros(batch, length, dtype=torch.bool)
+    first[:, 0] = True
+    return rssm, torch.randn(batch, length, 4), torch.randn(batch, length, action_dim), first
+
+
+@contextlib.contextmanager
+def no_noise():
+    """Inside, samples are a fixed quantile, so that windows of different shape can be compared."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diswm, "gaussian_sample", lambda mean, std: mean + 0.3 * std)
+        yield
+
+
+def close(a, b):
+    """Whether two states agree in deter, stoch, mean and std."""
+    return all(torch.allclose(a[key], b[key], atol=1e-5) for key in a)
+
+
+def pick(state, index):
+    """Index every tensor of a state."""
+    return {key: value[index] for key, value in state.items()}
+
+
+@given(seeds, sizes, sizes)
+def test_filtering_a_window_equals_filtering_step_by_step(seed, batch, length):
+    """Training (observe) and acting (step) are one filter; priors come from the same h_t."""
+    rssm, embed, action, first = window(seed, batch, length)
+    with no_noise():
+        post, prior = rssm.observe(embed, action, first)
+        state = rssm.initial(batch)
+        for t in range(length):
+            state = rssm.step(state, action[:, t], embed[:, t], first[:, t])
+            assert close(state, pick(post, (slice(None), t)))
+            assert close(rssm.prior(state["deter"]), pick(prior, (slice(None), t)))
+
+
+def check_is_first_forgets_everything(seed=0, seam=3):
+    """From a seam on, a window gives the states of a window that starts there, action included."""
+    rssm, embed, action, first = window(seed)
+    first[:, seam] = True
+    with no_noise():
+        post, _ = rssm.observe(embed, action, first)
+        action[:, seam] += 7  # of another episode
+        alone, _ = rssm.observe(embed[:, seam:], action[:, seam:], first[:, seam:])
+    assert close(pick(post, (slice(None), slice(seam, None))), alone)
+
+
+@given(seeds, st.integers(1, 5))
+def test_is_first_forgets_the_state_and_the_previous_action(seed, seam):
+    """A window across a seam equals two windows."""
+    check_is_first_forgets_everything(seed, seam)
+
+
+@given(seeds, st.integers(1, 5))
+def test_filtering_is_causal_and_priors_do_not_see_their_own_image(seed, t):
+    """Row t's image changes posteriors from t, priors from t + 1; row t's action both from t on."""
+    rssm, embed, action, first = window(seed)
+    other_embed, other_action = embed.clone(), action.clone()
+    other_embed[:, t] += 3
+    other_action[:, t] += 3
+    with no_noise():
+        states = rssm.observe(embed, action, first)
+        by_image = rssm.observe(other_embed, action, first)
+        by_action = rssm.observe(embed, other_action, first)
+
+    def change(kind, other):  # first row that differs
+        gap = (states[kind]["mean"] - other[kind]["mean"]).abs().amax((0, 2)) > 1e-6
+        return gap.nonzero()[0].item() if gap.any() else len(gap)
+    assert [change(0, by_image), change(1, by_image)] == [t, t + 1]
+    assert [change(0, by_action), change(1, by_action)] == [t, t]
+
+
+@given(seeds, st.permutations(range(3)))
+def test_permuting_the_batch_permutes_the_states(seed, order):
+    """Windows do not see each other."""
+    rssm, embed, action, first = window(seed)
+    first[1, 2] = True
+    order = list(order)
+    with no_noise():
+        states = rssm.observe(embed, action, first)
+        permuted = rssm.observe(embed[order], action[order], first[order])
+    assert all(close(pick(a, order), b) for a, b in zip(states, permuted, strict=True))
+
+
+def test_the_action_free_model_takes_no_actions():
+    """Eq. (1): the same states whatever the batch says about actions; Eq. (4): not so."""
+    cfg, batch = tiny_config(), diswm.to_device(fake_batch(2, 4), CPU)
+    changed = batch | {"action": batch["action"] + 1}
+    without = {key: batch[key] for key in ("image", "is_first")}
+    with no_noise():
+        video, world = diswm.VideoPredictor(cfg), diswm.WorldModel(cfg, 2)
+        assert torch.equal(video(batch)["feat"], video(without)["feat"])
+        assert torch.equal(video(batch)["feat"], video(changed)["feat"])
+        assert not torch.allclose(world(batch)["feat"], world(changed)["feat"])
+    count = [sum(p.numel() for p in model.rssm.parameters()) for model in (video, world)]
+    assert count[1] - count[0] == 2 * cfg.hidden  # the action's input weights
+
+
+def test_the_recurrence_is_a_gru_cell_with_layer_norm():
+    """One linear map and norm for reset, candidate, update; h' = u·c + (1 − u)·h, u = σ(x − 1)."""
+    rssm, embed, action, _ = window(0)
+    state = {key: torch.randn_like(x) for key, x in rssm.initial(3).items()}
+    x = rssm.inputs(torch.cat([state["stoch"], action[:, 0]], -1))
+    gates = rssm.gru(torch.cat([x, state["deter"]], -1)).double().numpy()
+    gates = (gates - gates.mean(-1, keepdims=True)) / np.sqrt(gates.var(-1, keepdims=True) + 1e-5)
+    reset, candidate, update = np.split(gates, 3, -1)
+
+    def sigmoid(value):
+        return 1 / (1 + np.exp(-value))
+    update = sigmoid(update - 1)
+    expected = update * np.tanh(sigmoid(reset) * candidate) + (1 - update) * state["deter"].numpy()
+    np.testing.assert_allclose(rssm.recur(state, action[:, 0]).numpy(), expected, atol=1e-5)
+
+
+def test_latents_are_sampled_not_means():
+    """The β-VAE's 𝐳 and the RSSM's z_t, as the paper writes; the published code takes means."""
+    cfg, batch = tiny_config(), diswm.to_device(fake_batch(2, 3), CPU)
+    for model in (diswm.VideoPredictor(cfg), diswm.WorldModel(cfg, 2)):
+        one, two = model(batch), model(batch)
+        assert torch.equal(one["code"]["mean"], two["code"]["mean"])
+        assert not torch.allclose(one["embed"], two["embed"])
+        assert not torch.allclose(one["post"]["stoch"], one["post"]["mean"])
+
+
+# === Replay =======================================================================================
+
+def numbered_rows(first, length, terminal=False):
+    """An episode whose rows carry their number, `first` … `first + length − 1`, in every array."""
+    rows = []
+    for n in range(first, first + length):
+        image = np.full((64, 64, 3), n % 251, np.uint8)
+        image[0, 0] = n // 251
+        rows.append(make_row(image, np.array([n, -n], np.float32), n / 2,
+                             terminal and n == first + length - 1, n == first))
+    return rows
+
+
+ROW_DTYPES = dict(image=np.uint8, action=np.float32, reward=np.float32, discount=np.float32,
+                  is_first=np.bool_, is_terminal=np.bool_)  # issue 2: the arrays of an episode
+
+
+def rows_to_arrays(rows):
+    """What a reader of the rows expects: dict of arrays (T, ...)."""
+    return {key: np.array([row[key] for row in rows], dtype)
+            for key, dtype in ROW_DTYPES.items()}
+
+
+def assert_same(arrays, expected):
+    """Equal keys, dtypes and values."""
+    assert arrays.keys() == expected.keys()
+    for key, value in expected.items():
+        assert arrays[key].dtype == value.dtype and np.array_equal(arrays[key], value), key
+
+
+class ReplayMachine(RuleBasedStateMachine):
+    """Replay against a plain list of episodes: add, evict, sample, checkpoint, go back to it."""
+
+    @initialize(capacity=st.integers(1, 30))
+    def start(self, capacity):
+        self.tmp = tempfile.TemporaryDirectory()
+        self.capacity, self.count = capacity, 0
+        self.replay, self.episodes = self.open(), []
+        self.saved = self.replay.state_dict(), []
+
+    def open(self):
+        return Replay(Path(self.tmp.name) / "episodes", self.capacity)
+
+    @property
+    def flat(self):
+        return [row for episode in self.episodes for row in episode]
+
+    @rule(length=st.integers(1, 9), terminal=st.booleans())
+    def add(self, length, terminal):
+        self.episodes.append(numbered_rows(self.count, length, terminal))
+        self.replay.add(self.episodes[-1])
+        self.count += length
+        while len(self.flat) - len(self.episodes[0]) >= self.capacity:
+            self.episodes.pop(0)
+
+    @precondition(lambda self: self.episodes)
+    @rule(data=st.data())
+    def read_a_window(self, data):
+        start = data.draw(st.integers(0, len(self.flat) - 1))
+        length = data.draw(st.integers(1, len(self.flat) - start))
+        expected = rows_to_arrays(self.flat[start:start + length])
+        assert_same(self.replay.window(start, length), expected)
+
+    @precondition(lambda self: self.episodes)
+    @rule(data=st.data(), batch=st.integers(1, 4), seed=st.integers(0, 99))
+    def draw_a_batch(self, data, batch, seed):
+        length = data.draw(st.integers(1, len(self.flat)))
+        windows = self.replay.sample(batch, length, np.random.default_rng(seed))
+        numbers = [int(row["action"][0]) for row in self.flat]
+        for b in range(batch):
+            start = numbers.index(windows["action"][b, 0, 0])
+            expected = rows_to_arrays(self.flat[start:start + length])
+            expected["is_first"][0] = True
+            assert_same({key: value[b] for key, value in windows.items()}, expected)
+
+    @rule()
+    def checkpoint(self):
+        self.saved = self.replay.state_dict(), list(self.episodes)
+        self.replay.prune()
+
+    @rule()
+    def go_back_to_checkpoint(self):
+        """A run cut off before its next checkpoint: later episodes go, evicted ones come back."""
+        self.replay = self.open()
+        self.replay.load_state_dict(self.saved[0])
+        self.episodes = list(self.saved[1])
+
+    @invariant()
+    def holds_the_same_rows(self):
+        assert self.replay.rows == len(self.flat)
+        assert len(self.replay.paths) == len(self.episodes)
+        assert self.replay.paths == sorted(self.replay.paths)
+
+    @invariant()
+    def needs_every_episode_for_its_capacity(self):
+        assert not self.episodes or self.replay.rows - len(self.episodes[0]) < self.capacity
+
+    def teardown(self):
+        if hasattr(self, "tmp"):
+            self.tmp.cleanup()
+
+
+def test_replay_agrees_with_a_list_of_episodes_through_any_history():
+    """Windows, order, capacity, eviction, save and load, going back: DESIGN, "Replay"."""
+    run_state_machine_as_test(ReplayMachine, settings=settings(
+        settings.get_profile("diswm"), max_examples=40, stateful_step_count=25))
+
+
+def test_replay_reaches_every_start_and_no_other(tmp_path):
+    """An off-by-one in the sampler loses the newest row for ever: windows start anywhere."""
+    replay = Replay(tmp_path)
+    replay.add(numbered_rows(0, 7))
+    replay.add(numbered_rows(7, 6))
+    batch = replay.sample(600, 4, np.random.default_rng(0))
+    starts, counts = np.unique(batch["action"][:, 0, 0].astype(int), return_counts=True)
+    assert starts.tolist() == list(range(13 - 4 + 1))
+    assert counts.min() > 30  # uniform: 60 each
+
+
+def test_replay_marks_seams_and_first_rows_of_windows(tmp_path):
+    """Without a mark, the RSSM carries one episode's state into the next."""
+    replay = Replay(tmp_path)
+    for first in (0, 5, 10):
+        replay.add(numbered_rows(first, 5))
+    batch = replay.sample(50, 8, np.random.default_rng(0))
+    number = batch["action"][:, :, 0]
+    assert np.array_equal(batch["is_first"][:, 1:], number[:, 1:] % 5 == 0)
+    assert batch["is_first"][:, 0].all()
+    assert not replay.window(1, 4)["is_first"].any()  # the stored rows stay as they were
+
+
+def test_replay_files_are_plain_npz_that_numpy_opens(tmp_path):
+    """Issue 2: an episode is a file that np.load opens, with these six arrays."""
+    replay = Replay(tmp_path)
+    rows = numbered_rows(0, 4, terminal=True)
+    replay.add(rows)
+    with np.load(replay.paths[0], allow_pickle=False) as file:
+        assert_same(dict(file), rows_to_arrays(rows))
+    assert replay.window(3, 1)["discount"] == 0
+
+
+def test_replay_never_deletes_what_the_last_checkpoint_needs(tmp_path):
+    """Eviction drops an episode from the index; its file goes only after the next checkpoint."""
+    replay = Replay(tmp_path, capacity=4)
+    for first in (0, 4, 8):
+        replay.add(numbered_rows(first, 4))
+    assert len(replay.paths) == 1 and len(list(tmp_path.glob("*.npz"))) == 3
+    replay.prune()
+    assert list(tmp_path.glob("*.npz")) == replay.paths
+
+
+def test_replay_refuses_to_go_back_when_an_episode_is_missing(tmp_path):
+    """A run whose episodes were deleted must not go on with fewer."""
+    replay = Replay(tmp_path)
+    for first in (0, 4):
+        replay.add(numbered_rows(first, 4))
+    replay.paths[0].unlink()
+    with pytest.raises(UserError, match="--fresh"):
+        Replay(tmp_path).load_state_dict(replay.state_dict())
+
+
+class CountingEnv(gym.Env):
+    """Pixel (0, 0) holds (step, code of the action, episode); reward of step n: n + action / 2."""
+
+    def __init__(self, length, terminates):
+        self.length, self.terminates, self.episode = length, terminates, 0
+        self.observation_space = gym.spaces.Box(0, 255, (64, 64, 3), np.uint8)
+        self.action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def picture(self, action):
+        image = np.zeros((64, 64, 3), np.uint8)
+        image[0, 0] = self.count, round(float(action[0] + 1) * 100), self.episode
+        return image
+
+    def reset(self, *, seed=None, options=None):
+        self.count, self.episode = 0, self.episode + 1
+        return self.picture([-1]), {}
+
+    def step(self, action):
+        self.count += 1
+        done = self.count == self.length
+        return (self.picture(action), self.count + float(action[0]) / 2,
+                done and self.terminates, done and not self.terminates, {})
+
+
+def counting_trainer(cfg, folder, length, terminates=False):
+    """The production trainer, playing CountingEnv through the production action repeat."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diswm, "config_env", lambda cfg, *args, **kwargs: diswm.ActionRepeat(
+            CountingEnv(length, terminates), cfg.action_repeat))
+        return AgentTrainer(cfg, Path(folder), CPU)
+
+
+@settings(max_examples=8)
+@given(repeat=st.integers(1, 3), length=st.integers(9, 30), terminates=st.booleans())
+def test_replay_rows_align_image_with_the_action_and_reward_that_led_to_it(
+        repeat, length, terminates):
+    """Row t: image[t], the action[t] and reward[t] that led to it; row 0 has zeros and is_first."""
+    cfg = tiny_config("dreamerv2", action_repeat=repeat, steps=2 * length, prefill=5, train_every=9,
+                      batch_length=3, switch=1.0)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = counting_trainer(cfg, folder, length, terminates)
+        for _ in range(2):
+            trainer.replay.add(trainer.play()[0])
+        rows = trainer.replay.window(0, trainer.replay.rows)
+    assert trainer.updates > 0  # the agent, not only prefill, has acted
+    per_episode = -(-length // repeat) + 1
+    assert len(rows["reward"]) == 2 * per_episode
+    for row in range(2 * per_episode):
+        t, last = row % per_episode, row % per_episode == per_episode - 1
+        count, code, _ = rows["image"][row, 0, 0]
+        action = rows["action"][row, 0]
+        assert count == min(t * repeat, length)
+        assert rows["is_first"][row] == (t == 0)
+        assert rows["is_terminal"][row] == (last and terminates) == (rows["discount"][row] == 0)
+        if t == 0:
+            assert not rows["action"][row].any() and rows["reward"][row] == 0
+        else:
+            steps = np.arange((t - 1) * repeat + 1, count + 1)
+            assert code == round(float(action + 1) * 100)
+            assert np.isclose(rows["reward"][row], (steps + action / 2).sum(), atol=1e-4)
+
+
+def test_evaluation_episodes_align_like_training_episodes():
+    """play_episode's rows make the evaluation video; their rewards sum to the return."""
+    env = diswm.ActionRepeat(CountingEnv(9, False), 2)
+    episode = diswm.play_episode(env, diswm.random_policy(env, 0), 0, "train")
+    total, rows = sum(row["reward"] for row in episode), rows_to_arrays(episode)
+    assert rows["image"][:, 0, 0, 0].tolist() == [0, 2, 4, 6, 8, 9]
+    codes = np.round((rows["action"][1:, 0].astype(float) + 1) * 100)
+    assert np.array_equal(rows["image"][1:, 0, 0, 1], codes)
+    assert np.isclose(total, rows["reward"].sum()) and not rows["is_terminal"].any()
+
+
+# === Environments =================================================================================
+
+def roll(env, seed, steps=4, phase=None):
+    """Reset and play seeded random actions → (observations, rewards)."""
+    rng = np.random.default_rng(seed)
+    observations, rewards = [env.reset(seed=seed, options=phase and dict(phase=phase))[0]], []
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        observation, reward, *_ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+    return np.array(observations), np.array(rewards)
+
+
+def closing_env(*args, **kwargs):
+    """make_env in a with-statement."""
+    return contextlib.closing(make_env(*args, **kwargs))
+
+
+def materials(env):
+    """RGB of all materials as the simulator has them now, (n, 3)."""
+    return env.unwrapped.model.mat_rgba[:, :3].copy()
+
+
+@pytest.mark.parametrize("task", PAPER_TASKS)
+def test_every_task_of_the_paper_gives_64_by_64_pixels_and_bounded_actions(task):
+    """Issue 2's task list, through the one adapter."""
+    with closing_env(task) as env:
+        observations, rewards = roll(env, 0, steps=2)
+        assert env.action_space.low.min() == -1 and env.action_space.high.max() == 1
+    assert observations.shape == (3, 64, 64, 3) and observations.dtype == np.uint8
+    assert observations.std() > 5 and np.isfinite(rewards).all()
+    assert (rewards >= 0).all() and (rewards <= 2).all()  # DMC: 0..1 per env step, repeat 2
+
+
+@pytest.mark.parametrize("task", ["walker_walk", "cartpole_swingup"])
+@pytest.mark.filterwarnings("ignore:.*The environment .* is different from the unwrapped version.*")
+def test_env_passes_gymnasiums_checker(task):
+    """The stack is a gymnasium.Env: spaces, dtypes, seeding, return values."""
+    with closing_env(task, time_limit=20) as env:
+        check_env(env, skip_render_check=True, skip_close_check=True)
+
+
+@settings(max_examples=4)
+@given(seed=st.integers(0, 2**31), phase=st.sampled_from(["train", "shifted"]))
+def test_same_seed_gives_the_same_pixels_and_another_seed_others(seed, phase):
+    """The published code leaves its colours unseeded."""
+    with closing_env("walker_walk", phase=phase) as one, closing_env("walker_walk", seed=3) as two:
+        first, again = roll(one, seed), roll(two, seed, phase=phase)
+        other = roll(two, seed + 1)
+    assert np.array_equal(first[0], again[0]) and np.array_equal(first[1], again[1])
+    assert not np.array_equal(first[0][0], other[0][0])
+
+
+def test_zero_color_range_around_the_originals_changes_no_pixel():
+    """--colors original --color-range 0 is the task as it is."""
+    plain = dict(colors="original", color_range=0.0)
+    with closing_env("walker_walk", phase="none") as none:
+        expected = roll(none, 5)[0]
+    with closing_env("walker_walk", phase="train", **plain) as zero:
+        assert np.array_equal(roll(zero, 5)[0], expected)
+    with closing_env("walker_walk", phase="train") as distracted:
+        assert not np.array_equal(roll(distracted, 5)[0], expected)
+
+
+@pytest.mark.parametrize("task", ["walker_walk", "cartpole_swingup", "reacher_easy"])
+def test_distractor_leaves_state_and_reward_bit_identical(task):
+    """The distractor changes what is seen, not what happens: its random stream is its own."""
+    with (closing_env(task, phase="none", pixels=False) as plain,
+          closing_env(task, phase="train", pixels=False, color_step_std=0.2) as distracted,
+          closing_env(task, phase="shifted") as seen):
+        states, rewards = roll(plain, 7, steps=10)
+        others, other_rewards = roll(distracted, 7, steps=10)
+        _, seen_rewards = roll(seen, 7, steps=10)
+        end = [env.unwrapped.data.qpos.tobytes() for env in (plain, distracted, seen)]
+    assert states.tobytes() == others.tobytes()
+    assert rewards.tobytes() == other_rewards.tobytes() == seen_rewards.tobytes()
+    assert end[0] == end[1] == end[2]
+
+
+@settings(max_examples=10)
+@given(phase=st.sampled_from(["train", "shifted"]), half=st.floats(0.01, 0.6),
+       seed=st.integers(0, 999), colors=st.sampled_from(["published", "original"]))
+def test_colors_fill_the_box_of_their_phase(phase, half, seed, colors):
+    """Boxes of ± range around (0.7, 0.3, 0.5) and (0.5, 0.7, 0.3), or around the originals."""
+    with closing_env("walker_walk", phase="none", pixels=False) as env:
+        original = materials(env)
+    center = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))[phase]
+    if colors == "original":
+        center = original if phase == "train" else np.roll(original, 1, -1)
+    low, high = np.clip(center - np.float64(half), 0, 1), np.clip(center + np.float64(half), 0, 1)
+    changes = dict(phase=phase, colors=colors, color_range=half)
+    with closing_env("walker_walk", pixels=False, **changes) as env:
+        draws = []
+        for index in range(30):
+            env.reset(seed=seed + index)
+            draws.append(materials(env))
+    draws = np.array(draws)
+    assert (draws >= low - 1e-6).all() and (draws <= high + 1e-6).all()
+    assert (np.ptp(draws, axis=0) > 0.5 * (high - low)).all()
+
+
+def test_random_walk_stays_in_its_box_and_moves():
+    """--color-step-std: colours walk every decision, clipped to the box of the episode's phase."""
+    with closing_env("walker_walk", phase="train", pixels=False, color_step_std=0.2) as env:
+        env.reset(seed=0)
+        colors = [materials(env)]
+        for _ in range(40):
+            env.step(env.action_space.sample())
+            colors.append(materials(env))
+    colors = np.array(colors)
+    assert (np.abs(colors - (0.7, 0.3, 0.5)) <= 0.2 + 1e-6).all()
+    assert (colors[1:] != colors[:-1]).any((1, 2)).all()
+
+
+def check_action_repeat_sums_rewards(task="walker_walk", repeat=2, seed=0):
+    """make_env(action_repeat=n) against n plain steps of the simulator, for 12 decisions."""
+    raw, rng = diswm.DMControlEnv(*TASKS[task]), np.random.default_rng(seed)
+    with contextlib.closing(raw), closing_env(task, pixels=False, action_repeat=repeat) as env:
+        raw.reset(seed=seed)
+        env.reset(seed=seed)
+        for _ in range(12):
+            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            observation, reward, *_, info = env.step(action)
+            steps = [raw.step(action) for _ in range(repeat)]
+            assert reward > 0 and np.isclose(reward, sum(step[1] for step in steps), rtol=1e-9)
+            assert np.array_equal(observation, steps[-1][0])
+            assert info["env_steps"] == repeat
+
+
+@pytest.mark.parametrize("repeat", [1, 2, 5])
+def test_action_repeat_sums_the_rewards_of_its_steps_once(repeat):
+    """Published code: `reward += reward` doubles them; two wrappers apply the repeat twice."""
+    check_action_repeat_sums_rewards(repeat=repeat, seed=repeat)
+
+
+STEP = diswm.ActionRepeat.step
+
+
+def doubled_reward(self, action):
+    """Section 2, row 10: `reward += reward`."""
+    observation, reward, *rest = STEP(self, action)
+    return observation, reward + reward, *rest
+
+
+def doubled_repeat(self, action):
+    """Section 2, row 10: a second repeat around the first, of which nobody knows."""
+    _, first, *_ = STEP(self, action)
+    observation, second, *rest = STEP(self, action)
+    return observation, first + second, *rest
+
+
+def last_reward(self, action):
+    """Only the last reward of the repeat counts."""
+    for _ in range(self.n):
+        result = self.env.step(action)
+    return *result[:4], {"env_steps": self.n}
+
+
+@pytest.mark.parametrize("bug", [doubled_reward, doubled_repeat, last_reward])
+def test_planted_action_repeat_bug_is_noticed(bug, monkeypatch):
+    """The check above bites."""
+    monkeypatch.setattr(diswm.ActionRepeat, "step", bug)
+    with pytest.raises(AssertionError):
+        check_action_repeat_sums_rewards()
+
+
+@pytest.mark.parametrize("limit", [7, 8])
+def test_time_limit_counts_env_steps_and_is_no_terminal(limit):
+    """Time limits truncate; a repeat that they cut short counts the steps that were made."""
+    with closing_env("walker_walk", pixels=False, time_limit=limit) as env:
+        env.reset(seed=0)
+        steps, done = 0, False
+        while not done:
+            *_, terminated, truncated, info = env.step(env.action_space.sample())
+            steps, done = steps + info["env_steps"], terminated or truncated
+    assert steps == limit and truncated and not terminated
+
+
+def test_envs_alive_at_once_do_not_mix_textures():
+    """gymnasium's renderer forgets to switch GL contexts: one env gets the other's textures."""
+    kinds = (("walker_walk", "train"), ("cartpole_swingup", "none"), ("walker_walk", "shifted"))
+    alone = []
+    for task, phase in kinds:
+        with closing_env(task, phase=phase) as env:
+            alone.append(roll(env, 2, steps=6)[0])
+    with contextlib.ExitStack() as stack:
+        envs = [stack.enter_context(closing_env(task, phase=phase)) for task, phase in kinds]
+        rngs, count = [np.random.default_rng(2) for _ in kinds], [0] * len(kinds)
+        for env, frames in zip(envs, alone, strict=True):
+            assert np.array_equal(env.reset(seed=2)[0], frames[0])
+        for i in np.random.default_rng(0).permutation([0, 1, 2] * 6):
+            action = rngs[i].uniform(-1, 1, envs[i].action_space.shape).astype(np.float32)
+            count[i] += 1
+            assert np.array_equal(envs[i].step(action)[0], alone[i][count[i]]), kinds[i]
+
+
+def switching_trainer(folder, **changes):
+    """A real trainer whose midpoint, 50, falls into the middle of its third episode."""
+    cfg = tiny_config("dreamerv2", steps=100, time_limit=20, prefill=1000, eval_every=1000,
+                      eval_episodes=1, **changes)
+    return AgentTrainer(cfg, Path(folder), CPU)
+
+
+def play_on(trainer, episodes=99):
+    """Episodes as the training loop runs them → [(first step, phase, centre of the colours), …]."""
+    seen = []
+    while trainer.progress < trainer.total and len(seen) < episodes:
+        start = trainer.progress
+        trainer.replay.add(trainer.play()[0])
+        trainer.episodes += 1
+        seen.append((start, trainer.env.get_wrapper_attr("phase"), materials(trainer.env).mean(0)))
+    return seen
+
+
+def test_colors_switch_exactly_once_at_the_midpoint_of_a_live_run(tmp_path):
+    """Section 2, row 9: it fires at half of the env steps and ends the running episode."""
+    trainer = switching_trainer(tmp_path)
+    with contextlib.closing(trainer.env), contextlib.closing(trainer.eval_env):
+        seen = play_on(trainer)
+    assert [(start, phase) for start, phase, _ in seen] == [
+        (0, "train"), (20, "train"), (40, "train"),
+        (50, "shifted"), (70, "shifted"), (90, "shifted")]
+    for _, phase, color in seen:
+        assert np.abs(color - diswm.COLOR_CENTERS[phase]).max() < 0.2  # the simulator's own colours
+
+
+@pytest.mark.parametrize("cut", [2, 3, 4])
+def test_color_switch_survives_a_resume(tmp_path, cut):
+    """A switch that fires on `step == midpoint` is lost, or fires twice, when cut there."""
+    trainers = [switching_trainer(tmp_path) for _ in range(2)]
+    with contextlib.ExitStack() as stack:
+        for trainer in trainers:
+            stack.callback(trainer.env.close), stack.callback(trainer.eval_env.close)
+        seen = play_on(trainers[0], cut)
+        trainers[1].replay = Replay(tmp_path / "episodes")
+        trainers[1].load_state_dict(trainers[0].state_dict())
+        seen += play_on(trainers[1])
+    assert [phase for _, phase, _ in seen] == ["train"] * 3 + ["shifted"] * 3
+
+
+def test_switch_at_one_never_changes_the_colors(tmp_path):
+    """Collect uses the `train` colours throughout."""
+    trainer = switching_trainer(tmp_path, switch=1.0)
+    with contextlib.closing(trainer.env), contextlib.closing(trainer.eval_env):
+        assert {phase for _, phase, _ in play_on(trainer)} == {"train"}
+
+
+# === Stage transitions ============================================================================
+
+RUN = "runs/finetune/cheetah_run-walker_walk/diswm/seed0"
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch):
+    """An empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("argv, says", [
+    (("finetune", "--dst", "walker_walk"), "python diswm.py pretrain --src cheetah_run"),
+    (("finetune", "--dst", "walker_walk", "--method", "no_disentangle"),
+     "python diswm.py pretrain --src cheetah_run --method no_disentangle"),
+    (("pretrain", "--videos", "."), "python diswm.py collect"),
+    (("evaluate", "--run", RUN), "checkpoint"),
+    (("traverse", "--run", RUN), "checkpoint"),
+    (("plot",), "python diswm.py finetune"),
+], ids=lambda value: "-".join(value[:1]) if isinstance(value, tuple) else "")
+def test_stage_refuses_to_start_without_the_one_before(argv, says, empty):
+    """collect → pretrain → finetune → evaluate, traverse, plot: one line says what is missing."""
+    refuse(*argv, *DEBUG, says=says)
+    assert not list(empty.rglob("*.pt"))
+
+
+def test_finetune_refuses_an_unfinished_teacher(teacher, tmp_path):
+    """A pretraining that was cut off is no teacher; the message says what finishes it."""
+    state = torch.load(teacher, weights_only=True)
+    state["trainer"]["progress"] = 7
+    torch.save(state, tmp_path / "half.pt")
+    refuse("finetune", "--teacher", tmp_path / "half.pt", "--runs", tmp_path / "runs", *DEBUG,
+           says=("7 of 20", "python diswm.py pretrain --src cheetah_run"))
+
+
+def test_evaluate_refuses_a_run_without_a_policy(teacher):
+    """A video predictor cannot act."""
+    refuse("evaluate", "--run", teacher.parent, says="finetune")
+
+
+def test_finetune_refuses_a_policy_as_a_teacher(finished, tmp_path):
+    """--teacher takes a pretrain checkpoint."""
+    refuse("finetune", "--teacher", finished / "checkpoint.pt", "--runs", tmp_path / "runs", *DEBUG,
+           says="python diswm.py pretrain --src cheetah_run")
+
+
+def test_pretraining_sees_only_images_and_where_episodes_begin(root, tmp_path):
+    """From collect to pretrain goes exactly the video: no action, no reward, whatever they are."""
+    source = next((root / "runs/collect").rglob("episodes"))
+    for path in source.glob("*.npz"):
+        with np.load(path) as episode:
+            np.savez(tmp_path / path.name, image=episode["image"], is_first=episode["is_first"])
+    videos = [diswm.open_videos(folder, tmp_path / "cache") for folder in (source, tmp_path)]
+    batches = [video.sample(4, 8, np.random.default_rng(0)) for video in videos]
+    assert batches[0].keys() == {"image", "is_first"}
+    assert_same(batches[0], batches[1])
+
+
+def test_finetuning_takes_exactly_the_teachers_encoder_and_leaves_it_as_it_was(teacher, finished):
+    """Section 2, row 2: the published code trains the teacher along. Its bytes must not change."""
+    before = torch.load(teacher, weights_only=True)["trainer"]["model"]
+    after = torch.load(finished / "checkpoint.pt", weights_only=True)["trainer"]
+    kept = after["teacher"]["weights"]
+    encoder = {key for key in before if key.startswith("encoder.")}
+    assert {f"encoder.{key}" for key in kept} == encoder
+    assert all(torch.equal(value, before[f"encoder.{key}"]) for key, value in kept.items())
+    assert not any(torch.equal(value, after["agent"]["model"][f"encoder.{key}"])
+                   for key, value in kept.items() if key.endswith("weight"))
+
+
+@settings(max_examples=10)
+@given(prefill=st.integers(0, 25), first=st.integers(1, 4), every=st.integers(1, 6),
+       delay=st.integers(0, 40), decay=st.integers(5, 60))
+def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
+        prefill, first, every, delay, decay):
+    """The published schedule; η counts live decisions, prefill included (row 3)."""
+    cfg = tiny_config("diswm", prefill=prefill, first_updates=first, train_every=every, steps=100,
+                      eta_delay=delay, eta_decay=decay, eta=0.1, eta_end=0.01, batch_length=8)
+    acted, calls = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = counting_trainer(cfg, folder, length=20)
+        act = trainer.agent.act
+        trainer.agent.act = lambda *args, **kwargs: (
+            acted.append(trainer.decisions) or act(*args, **kwargs))
+        trainer.agent.update = lambda batch, eta, update, probe=False: calls.append(
+            (trainer.decisions, update, eta)) or {}
+        play_on_counting(trainer)
+    # Nothing can be learnt before the first episode, of ten decisions, is in the replay.
+    start = max(prefill, 11)
+    due = [start] * first + [n for n in range(start + 1, 51) if n % every == 0]
+    assert [decision for decision, _, _ in calls] == due
+    assert [update for _, update, _ in calls] == list(range(len(due)))
+    assert acted == list(range(prefill, 50))
+    for decision, _, eta in calls:
+        expected = 0 if decision < delay else max(0.1 * (1 - (decision - delay) / decay), 0.01)
+        assert eta == pytest.approx(expected)
+
+
+def play_on_counting(trainer):
+    """Play a CountingEnv trainer to its end."""
+    while trainer.progress < trainer.total:
+        trainer.replay.add(trainer.play()[0])
+        trainer.episodes += 1
+
+
+# === System: one whole pipeline ===================================================================
+
+TERMS = {
+    "image", "reward", "discount", "kl", "disentangle", "distill", "eta", "actor", "critic",
+    "actor_entropy", "post_entropy", "prior_entropy", "model_grad_norm", "actor_grad_norm",
+    "critic_grad_norm", "distill_grad_norm", "train_return", "eval_return", "rate", "seconds"}
+
+
+def read_rows(folder):
+    """metrics.jsonl as a list of dicts."""
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def check_picture(path, low=100):
+    """The file opens as a picture of sane size that is not of one colour."""
+    picture = iio.imread(path)
+    assert min(picture.shape[:2]) >= low and max(picture.shape[:2]) < 4000 and picture.std() > 5
+
+
+def test_pipeline_logs_every_loss_term_by_name(finished):
+    """Issue 2, point 5. All numbers are finite, and η falls."""
+    rows = read_rows(finished)
+    values = {key: value for row in rows for key, value in row.items()}
+    assert values.keys() >= TERMS
+    assert all(np.isfinite(value).all() for row in rows for value in row.values()
+               if not isinstance(value, str))
+    eta = [row["eta"] for row in rows if "eta" in row]
+    assert eta[0] > eta[-1] == pytest.approx(PRESETS["debug"].eta_end)
+
+
+def test_pipeline_counts_env_steps_and_switches_once(finished):
+    """Steps in logs are simulator steps: repeat × decisions; 300 of them, half in each phase."""
+    rows = read_rows(finished)
+    assert [row["step"] for row in rows] == [50, 100, 150, 200, 250, 300]
+    assert all(row["step"] == 2 * row["decisions"] for row in rows)
+    assert [row["phase"] for row in rows] == ["train"] * 3 + ["shifted"] * 3
+    assert [row["step"] for row in rows if "eval_return" in row] == [100, 200, 300]
+
+
+def test_pipeline_evaluates_draws_and_plots(finished, teacher, root):
+    """pretrain → finetune → evaluate → traverse → plot on real DMC leaves files that open."""
+    succeed("evaluate", "--run", finished)
+    result = json.loads((finished / "evaluation.json").read_text())
+    assert (result["task"], result["phase"], result["step"]) == ("walker_walk", "shifted", 300)
+    assert len(result["returns"]) == 2
+    assert result["mean"] == pytest.approx(np.mean(result["returns"]))
+    assert result["std"] == pytest.approx(np.std(result["returns"])) and "random_mean" in result
+    video = iio.imread(finished / "evaluation.mp4")
+    assert video.shape[1:] == (256, 256, 3) and 24 <= len(video) <= 28 and video.std() > 5
+    for folder in (finished, teacher.parent):
+        succeed("traverse", "--run", folder)
+        check_picture(folder / "traversal.png", low=500)
+        check_picture(folder / "open_loop.png")
+    succeed("plot", "--runs", root / "runs", "--out", root / "curves.png")
+    check_picture(root / "curves.png")
+
+
+def test_pipeline_continues_a_finished_run_by_doing_nothing(finished, root):
+    """The same command run again resumes where it stopped: at the end."""
+    before = {path: path.read_bytes() for path in finished.rglob("*.npz")}
+    rows = read_rows(finished)
+    succeed("finetune", "--dst", "walker_walk", "--runs", root / "runs", *DEBUG)
+    assert read_rows(finished) == rows
+    assert {path: path.read_bytes() for path in finished.rglob("*.npz")} == before
+
+
+def test_fresh_starts_over_and_other_flags_are_refused(root, tmp_path):
+    """A resumed run must not silently change what it computes."""
+    argv = ("pretrain", "--src", "cheetah_run", "--runs", tmp_path, *DEBUG, "--videos",
+            next((root / "runs/collect").rglob("episodes")), "--pretrain-updates", 2)
+    succeed(*argv)
+    refuse(*argv, "--beta2", 0.5, says=("beta2", "--fresh"))
+    succeed(*argv, "--beta2", 0.5, "--fresh")
+
+
+@pytest.mark.parametrize("method", ["dreamerv2", "no_distill"])
+def test_methods_without_a_teacher_need_no_pretraining(method, tmp_path):
+    """The baselines and ablations run through the same command."""
+    succeed("finetune", "--method", method, "--runs", tmp_path, *DEBUG, "--steps", 120)
+    values = {key for row in read_rows(next(tmp_path.rglob("seed0"))) for key in row}
+    assert "distill" not in values and ("disentangle" in values) == (method != "dreamerv2")
+
+
+def test_bench_prints_times_memory_and_parameter_counts():
+    """Issue 2: the parameter count is printed by part."""
+    out = succeed("bench", *DEBUG)
+    for text in ("world_model", "teacher", "actor", "critic", "total", "train step", "frame",
+                 "peak memory"):
+        assert text in out
+
+
+def test_doctor_renders_and_prints_versions(empty):
+    """One frame per env family, versions, device."""
+    out = succeed("doctor", *DEBUG)
+    assert all(text in out for text in ("python", "torch", "mujoco", "cpu"))
+    check_picture(empty / "runs/doctor.png")
+
+
+README = Path(diswm.__file__).with_name("README.md")
+
+
+def readme_commands():
+    """Every `python diswm.py …` in README.md's code blocks, in file order, as argv lists."""
+    inside, commands = False, []
+    for line in README.read_text().replace("\\\n", " ").splitlines():
+        inside ^= line.startswith("```")
+        if inside and line.strip().startswith("python diswm.py "):
+            commands.append(shlex.split(line, comments=True)[2:])
+    return commands
+
+
+@pytest.mark.skipif(not README.exists(), reason="no README.md beside diswm.py")
+def test_every_readme_command_runs(empty):
+    """In file order, in one folder, at debug size (also where the README gives a longer one)."""
+    commands = readme_commands()
+    assert len(commands) >= 5
+    short = ("--steps", 200, "--collect-steps", 200, "--pretrain-updates", 5)
+    for argv in commands:
+        code, _, err = run_cli(*argv, *DEBUG, *short)
+        assert code == 0, f"python diswm.py {' '.join(argv)}: {err}"
+
+
+# === System: cut and resume =======================================================================
+
+def cut(patch, owner, name, call):
+    """Ctrl-C at the `call`-th call of owner.name, counted from 1."""
+    original, count = getattr(owner, name), [0]
+
+    @functools.wraps(original)
+    def wrapper(*args, **kwargs):
+        count[0] += 1
+        if count[0] == call:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)
+
+    patch.setattr(owner, name, wrapper)
+    return count
+
+
+# The switch, at 130, falls into an episode; so does no evaluation: they follow episodes 3 and 6.
+CUT_FLAGS = (*DEBUG, "--steps", 260, "--eval-every", 120, "--slow-every", 4)
+
+
+def cut_command(teacher, runs):
+    """130 decisions: prefill 50, first updates at 50, slow copies at updates 0, 4, 8."""
+    return ("finetune", "--dst", "walker_walk", "--teacher", teacher, "--runs", runs, *CUT_FLAGS)
+
+
+def everything(run):
+    """All that a run leaves behind and that must not depend on interruptions."""
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    rows = [{key: value for key, value in row.items() if key not in ("seconds", "rate")}
+            for row in read_rows(run)]
+    files = {path.name: path.read_bytes() for path in sorted((run / "episodes").glob("*"))}
+    return dict(trainer=state["trainer"], rng=state["rng"], rows=rows, files=files)
+
+
+def assert_identical(one, two, where=""):
+    """Equal bit for bit, through dicts and lists."""
+    assert type(one) is type(two), where
+    if isinstance(one, dict):
+        assert list(one) == list(two), where
+        for key in one:
+            assert_identical(one[key], two[key], f"{where}/{key}")
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(two), where
+        for index, pair in enumerate(zip(one, two, strict=True)):
+            assert_identical(*pair, f"{where}/{index}")
+    elif isinstance(one, torch.Tensor):
+        assert one.dtype == two.dtype and torch.equal(one, two), where
+    else:
+        assert one == two, where
+
+
+@pytest.fixture(scope="session")
+def uncut(teacher, tmp_path_factory):
+    """What an uninterrupted finetuning leaves behind."""
+    runs = tmp_path_factory.mktemp("uncut")
+    succeed(*cut_command(teacher, runs))
+    return everything(next(runs.rglob("seed0")))
+
+
+def interrupt(owner, name, call, argv):
+    """Run a command with a cut in it: it exits 130, in one line, and the cut really fell."""
+    with pytest.MonkeyPatch.context() as patch:
+        count = cut(patch, owner, name, call)
+        code, _, err = run_cli(*argv)
+    assert count[0] >= call, f"{name} was called only {count[0]} times"
+    assert code == 130 and "Traceback" not in err and len(err.strip().splitlines()) == 1
+
+
+CUTS = {
+    "mid-episode in prefill": (diswm.ActionRepeat, "step", 40),
+    "between the first updates": (diswm.Agent, "update", 2),
+    "in the evaluation after the switch": (diswm.ActionRepeat, "step", 80),
+    "after an episode, before it is in the replay": (diswm.Replay, "add", 3),
+    "after the log row, before its checkpoint": (diswm.Run, "save", 4),
+    "after a checkpoint, before old episodes go": (diswm.Replay, "prune", 2),
+    "at the first decision in shifted colours": (diswm.ActionRepeat, "step", 116),
+    "at a copy of the slow critic": (diswm.ActorCritic, "copy_critic", 3),
+}
+
+
+@pytest.mark.parametrize("where", CUTS)
+def test_finetuning_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
+        where, teacher, uncut, tmp_path):
+    """Weights, Adam, slow critic, random numbers, replay files, log: wherever Ctrl-C falls."""
+    argv = cut_command(teacher, tmp_path)
+    interrupt(*CUTS[where], argv)
+    succeed(*argv)
+    assert_identical(everything(next(tmp_path.rglob("seed0"))), uncut)
+
+
+@settings(max_examples=1)
+@given(first=st.integers(1, 200), second=st.integers(1, 60))
+def test_finetuning_cut_twice_anywhere_equals_an_uncut_run_bit_for_bit(
+        teacher, uncut, first, second):
+    """Resume of a resume: the episode index, not the process, seeds an episode."""
+    with tempfile.TemporaryDirectory() as runs:
+        argv = cut_command(teacher, runs)
+        interrupt(diswm.ActionRepeat, "step", first, argv)
+        with pytest.MonkeyPatch.context() as patch:
+            cut(patch, diswm.ActionRepeat, "step", second)
+            assert run_cli(*argv)[0] in (0, 130)  # 0: less was left than `second`
+        succeed(*argv)
+        assert_identical(everything(next(Path(runs).rglob("seed0"))), uncut)
+
+
+@pytest.mark.parametrize("owner, name, call", [
+    (diswm.VideoTrainer, "update", 3), (diswm.VideoTrainer, "update", 8), (diswm.Run, "save", 3)])
+def test_pretraining_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
+        owner, name, call, root, tmp_path, monkeypatch):
+    """Batches have numbers: only weights, Adam and torch's random numbers need saving."""
+    monkeypatch.setattr(diswm.VideoTrainer, "chunk", 5)
+    videos = next((root / "runs/collect").rglob("episodes"))
+    argv = ("pretrain", "--videos", videos, *DEBUG, "--pretrain-updates", 12, "--runs")
+    succeed(*argv, tmp_path / "one")
+    interrupt(owner, name, call, (*argv, tmp_path / "two"))
+    succeed(*argv, tmp_path / "two")
+    one, two = (next((tmp_path / runs).rglob("seed0")) for runs in ("one", "two"))
+    assert_identical(everything(two), everything(one))
+
+
+def test_pretraining_sees_the_same_videos_whatever_the_chunk_of_its_log(
+        root, tmp_path, monkeypatch):
+    """How often a checkpoint is written must not change what is learnt."""
+    videos, weights = next((root / "runs/collect").rglob("episodes")), []
+    for chunk in (3, 100):
+        monkeypatch.setattr(diswm.VideoTrainer, "chunk", chunk)
+        succeed("pretrain", "--videos", videos, *DEBUG, "--pretrain-updates", 6, "--runs",
+                tmp_path / str(chunk))
+        path = next((tmp_path / str(chunk)).rglob("checkpoint.pt"))
+        weights.append(torch.load(path, weights_only=True)["trainer"]["model"])
+    assert_identical(*weights)
+
+
+@pytest.mark.parametrize("name", ["fsync", "replace"])
+def test_full_disk_during_a_save_leaves_the_old_checkpoint_valid(name, teacher, uncut, tmp_path):
+    """A checkpoint is written whole or not at all; a full disk is one line, and the run goes on."""
+    argv = cut_command(teacher, tmp_path)
+    interrupt(diswm.ActionRepeat, "step", 40, argv)
+    checkpoint = next(tmp_path.rglob("checkpoint.pt"))
+    before, real, target = checkpoint.read_bytes(), getattr(os, name), []
+
+    def full(*args):
+        target.append(args)
+        if len(target) == 2:  # the first is the episode's file, the second the checkpoint's
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, name, full)
+        refuse(*argv, says="No space left")
+    assert checkpoint.read_bytes() == before and diswm.read_checkpoint(checkpoint)
+    assert not list(tmp_path.rglob("*.tmp"))
+    succeed(*argv)
+    assert_identical(everything(checkpoint.parent), uncut)
+
+
+def test_kill_during_a_save_leaves_the_old_checkpoint_valid(teacher, uncut, tmp_path):
+    """What SIGKILL leaves: a half-written temporary file beside the last whole checkpoint."""
+    argv = cut_command(teacher, tmp_path)
+    interrupt(diswm.ActionRepeat, "step", 40, argv)
+    checkpoint = next(tmp_path.rglob("checkpoint.pt"))
+    whole = checkpoint.read_bytes()
+    (checkpoint.parent / "checkpoint.pt.tmp").write_bytes(whole[: len(whole) // 2])
+    (checkpoint.parent / "episodes/000001.npz.tmp").write_bytes(b"PK")
+    succeed(*argv)
+    assert_identical(everything(checkpoint.parent), uncut)
+
+
+@slow
+def test_repeated_kills_of_a_real_process_change_nothing(teacher, uncut, tmp_path):
+    """SIGKILL at four moments of four processes, then one that finishes."""
+    argv = [sys.executable, diswm.__file__, *map(str, cut_command(teacher, tmp_path))]
+    kills = 0
+    while kills < 4:
+        process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True)
+        for line in process.stdout:
+            if "/260 env steps" in line:  # an episode is done: the next one is under way
+                break
+        time.sleep(0.15 * kills)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        kills += 1
+    subprocess.run(argv, check=True, capture_output=True)
+    assert_identical(everything(next(tmp_path.rglob("seed0"))), uncut)
+
+
+@slow
+def test_ctrl_c_of_a_real_process_exits_130(teacher, tmp_path):
+    """SIGINT, as a terminal sends it: one line, no traceback."""
+    argv = [sys.executable, diswm.__file__, *map(str, cut_command(teacher, tmp_path))]
+    process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if "/260 env steps" in line:
+            break
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
+    assert process.returncode == 130 and "Traceback" not in err and "interrupted" in err
+
+
+# === System: bad input ============================================================================
+
+@pytest.mark.parametrize("argv, says", [
+    (("finetune", "--dst", "walker_wlak"), ("unknown", "walker_walk", "cartpole_swingup")),
+    (("collect", "--src", "cheetah"), ("unknown", "cheetah_run")),
+    (("finetune", "--no-such-flag", "1"), ("--no-such-flag", "--batch-size", "--preset")),
+    (("finetune", "--preset", "huge"), ("huge", "paper", "small", "debug")),
+    (("finetune", "--method", "ppo"), ("ppo", "dreamerv2", "no_distill")),
+    (("finetune", "--steps", "0"), ("--steps", "1")),
+    (("pretrain", "--pretrain-updates", "0"), ("--pretrain-updates",)),
+    (("finetune", "--batch-size", "many"), ("--batch-size", "many")),
+    (("finetune", "--colors", "pink"), ("pink", "published", "original")),
+    (("frobnicate",), ("frobnicate", "pretrain", "finetune")),
+], ids=lambda value: " ".join(value) if isinstance(value, tuple) and "-" in value[-1] else "")
+def test_wrong_usage_exits_2_and_lists_what_exists(argv, says, empty):
+    """Unknown task, flag, preset, method, command or value; nothing is written."""
+    refuse(*argv, code=2, says=says)
+    assert not list(empty.iterdir())
+
+
+def test_source_equal_to_target_is_refused(root):
+    """The teacher's task must differ from the target."""
+    refuse("finetune", "--src", "cheetah_run", "--dst", "cheetah_run", "--runs",
+           root / "runs", *DEBUG, says="cheetah_run")
+    teacher = next((root / "runs/pretrain").rglob("checkpoint.pt"))
+    refuse("finetune", "--src", "walker_walk", "--dst", "cheetah_run", "--teacher", teacher,
+           "--runs", root / "runs", *DEBUG, says="cheetah_run")
+
+
+def test_teacher_with_another_latent_size_is_refused(teacher, tmp_path):
+    """Eq. (3) needs the same latents on both sides; the message says the way out."""
+    refuse("finetune", "--teacher", teacher, "--z-dim", 7, "--runs", tmp_path, *DEBUG,
+           says=("20 latents", "--z-dim 20"))
+
+
+def test_missing_teacher_file_is_refused(tmp_path):
+    """--teacher with a path that is not there."""
+    refuse("finetune", "--teacher", tmp_path / "no.pt", "--runs", tmp_path, *DEBUG, says="no.pt")
+
+
+class Payload:
+    """Unpickling it runs a shell command."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.marker}",)
+
+
+def test_checkpoint_with_a_payload_is_refused_and_not_executed(teacher, tmp_path):
+    """A teacher from the internet must not run code."""
+    marker, path = tmp_path / "executed", tmp_path / "evil.pt"
+    state = torch.load(teacher, weights_only=True)
+    torch.save(state | {"config": Payload(marker)}, path)
+    with pytest.MonkeyPatch.context() as patch:  # not even with the variable that switches it on
+        patch.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
+        refuse("finetune", "--teacher", path, "--runs", tmp_path, *DEBUG,
+               says="evil.pt")
+    assert not marker.exists()
+    torch.load(path, weights_only=False)
+    assert marker.exists()  # the payload was a real one
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not a zip", b"hello\n" * 99, b"\x80\x04."],
+                         ids=["empty", "broken zip", "text", "broken pickle"])
+def test_file_that_is_no_checkpoint_is_refused(content, tmp_path):
+    """Also a foreign file in the place of the run's own checkpoint."""
+    (tmp_path / "checkpoint.pt").write_bytes(content)
+    refuse("evaluate", "--run", tmp_path, says=("checkpoint.pt", "--fresh"))
+
+
+def test_foreign_torch_files_are_refused(tmp_path):
+    """A state_dict, a list, a tensor: loadable, but none of ours."""
+    values = {"weight": torch.ones(2)}, [1, 2], torch.ones(3), {"config": 3}
+    for index, value in enumerate(values):
+        path = tmp_path / f"{index}.pt"
+        torch.save(value, path)
+        refuse("finetune", "--teacher", path, "--runs", tmp_path, *DEBUG, says=path.name)
+
+
+@settings(max_examples=25)
+@given(data=st.data())
+def test_truncated_checkpoint_is_refused(teacher, data):
+    """Whatever a cut-off copy holds, the error names the file."""
+    whole = teacher.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cut.pt"
+        path.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+        with pytest.raises(UserError, match="cut.pt"):
+            diswm.read_checkpoint(path)
+
+
+def save_video(path, length=12, compressed=False, **changes):
+    """A foreign episode, as the authors publish them: no is_first."""
+    rng = np.random.default_rng(length)
+    arrays = dict(image=rng.integers(0, 256, (length, 64, 64, 3), np.uint8),
+                  action=np.zeros((length, 6), np.float32), reward=np.zeros(length, np.float32),
+                  discount=np.ones(length, np.float32)) | changes
+    (np.savez_compressed if compressed else np.savez)(path, **arrays)
+    return arrays
+
+
+@pytest.mark.parametrize("changes, says", [
+    (dict(image=np.zeros((12, 64, 64, 3), np.float32)), "uint8"),
+    (dict(image=np.zeros((12, 32, 32, 3), np.uint8)), "(12, 32, 32, 3)"),
+    (dict(image=np.zeros((64, 64, 3), np.uint8)), "(64, 64, 3)"),
+    (dict(image=np.array([{}, None], object)), "episode"),
+], ids=["float images", "32 by 32", "one image", "objects"])
+@pytest.mark.parametrize("compressed", [False, True], ids=["plain", "compressed"])
+def test_video_of_wrong_shape_or_dtype_is_refused(changes, says, compressed, tmp_path):
+    """One line names the file and what is wrong with it."""
+    save_video(tmp_path / "bad.npz", compressed=compressed, **changes)
+    refuse("pretrain", "--videos", tmp_path, "--runs", tmp_path / "runs", *DEBUG,
+           says=("bad.npz", says))
+
+
+def test_video_without_images_is_refused(tmp_path):
+    """An .npz of something else."""
+    np.savez(tmp_path / "other.npz", observation=np.zeros(3))
+    refuse("pretrain", "--videos", tmp_path, "--runs", tmp_path / "runs", *DEBUG,
+           says=("other.npz", "image"))
+
+
+@settings(max_examples=25)
+@given(data=st.data(), compressed=st.booleans())
+def test_truncated_video_is_refused(data, compressed):
+    """Whatever a cut-off download holds, the error names the file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cut.npz"
+        save_video(path, compressed=compressed)
+        whole = path.read_bytes()
+        path.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+        with pytest.raises(UserError, match="cut.npz"):
+            diswm.open_videos(folder, Path(folder) / "cache")
+
+
+@settings(max_examples=40)
+@given(data=st.data(), compressed=st.booleans())
+def test_damaged_video_is_read_or_refused_but_never_a_traceback(data, compressed):
+    """Flipped bytes anywhere, also inside compressed data and headers."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bad.npz"
+        rows = 9
+        save_video(path, rows, compressed, image=np.zeros((rows, 64, 64, 3), np.uint8))
+        content = bytearray(path.read_bytes())
+        for _ in range(data.draw(st.integers(1, 3))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+        path.write_bytes(content)
+        with contextlib.suppress(UserError):
+            videos = diswm.open_videos(folder, Path(folder) / "cache")
+            batch = videos.sample(2, videos.rows, np.random.default_rng(0))
+            assert batch["image"].shape[2:] == (64, 64, 3)
+
+
+def test_empty_video_folder_is_refused(tmp_path):
+    """It says which command makes videos."""
+    refuse("pretrain", "--videos", tmp_path, "--runs", tmp_path / "runs", *DEBUG,
+           says=("no episodes", "python diswm.py collect"))
+
+
+@pytest.mark.parametrize("length", [0, 5, 7])
+def test_videos_shorter_than_one_window_are_refused(length, tmp_path):
+    """Not a crash inside the sampler."""
+    save_video(tmp_path / "short.npz", length)
+    refuse("pretrain", "--videos", tmp_path, "--runs", tmp_path / "runs", *DEBUG)
+
+
+def test_foreign_compressed_videos_are_unpacked_once_and_learnt_from(tmp_path):
+    """Issue 2: the authors' episodes are a video set as they are."""
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    arrays = [save_video(folder / f"20220101T0000-{n}.npz", n, True) for n in (9, 12)]
+    argv = ("pretrain", "--videos", folder, "--runs", tmp_path / "runs", *DEBUG,
+            "--pretrain-updates", 2)
+    succeed(*argv)
+    cache = next((tmp_path / "runs").rglob("videos"))
+    videos = Replay(cache, keys=diswm.VIDEO_KEYS)
+    found = [videos.window(end - length, length) for end, length in
+             zip(videos.ends, np.diff([0, *videos.ends]), strict=True)]
+    assert {window["image"].tobytes() for window in found} == {a["image"].tobytes() for a in arrays}
+    assert all(window["is_first"].tolist() == [True] + [False] * (len(window["is_first"]) - 1)
+               for window in found)
+    times = {path: path.stat().st_mtime_ns for path in cache.iterdir()}
+    succeed(*argv)
+    assert times == {path: path.stat().st_mtime_ns for path in cache.iterdir()}
+
+
+@pytest.mark.parametrize("command", ["collect", "pretrain", "finetune", "doctor"])
+def test_runs_folder_that_cannot_be_written_is_one_line(command, tmp_path):
+    """A file where a folder should be: as a read-only place looks to everyone, root included."""
+    (tmp_path / "runs").write_text("in the way")
+    refuse(command, "--runs", tmp_path / "runs", *DEBUG, says="runs")
+    assert (tmp_path / "runs").read_text() == "in the way"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_read_only_runs_folder_is_one_line(tmp_path):
+    """Permission denied."""
+    tmp_path.chmod(0o500)
+    refuse("collect", "--runs", tmp_path / "runs", *DEBUG, says="Permission denied")
+
+
+@pytest.mark.parametrize(
+    "loss", ["distillation_loss", "lambda_return", "rssm_kl_loss"])
+def test_nan_stops_the_run_and_leaves_the_checkpoint(loss, teacher, tmp_path):
+    """A loss that is not a number exits 1, names itself, and is in no saved weight."""
+    argv, real, calls = cut_command(teacher, tmp_path), getattr(diswm, loss), []
+
+    def broken(*args, **kwargs):
+        calls.append(loss)
+        value = real(*args, **kwargs)
+        if len(calls) < 4:
+            return value
+        return (value[0] * np.nan, value[1]) if isinstance(value, tuple) else value * np.nan
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diswm, loss, broken)
+        refuse(*argv, says="non-finite")
+    state = diswm.read_checkpoint(next(tmp_path.rglob("checkpoint.pt")))["trainer"]
+    assert state["progress"] == 130  # the last episode before the fourth update
+    assert all(value.isfinite().all() for part in ("model", "behaviour")
+               for value in state["agent"][part].values())
+
+
+def test_log_that_is_not_ours_is_one_line(tmp_path):
+    """plot reads metrics.jsonl files of others."""
+    folder = tmp_path / "finetune/a-b/diswm/seed0"
+    folder.mkdir(parents=True)
+    (folder / "metrics.jsonl").write_text("{broken\n")
+    refuse("plot", "--runs", tmp_path, says="metrics.jsonl")
+
+
+def test_stray_file_among_the_episodes_of_a_run_is_one_line(teacher, tmp_path):
+    """Somebody's copy in episodes/ must not end in a traceback on resume."""
+    argv = cut_command(teacher, tmp_path)
+    interrupt(diswm.ActionRepeat, "step", 40, argv)
+    episodes = next(tmp_path.rglob("episodes"))
+    shutil.copy(episodes / "000000.npz", episodes / "copy.npz")
+    code, _, err = run_cli(*argv)
+    assert code == 0 or err.startswith("error: ")
+
+
+# === The tests bite: a real bug put back makes its check fail =======
+
+def free_nats_first(real):
+    """Free nats on every step, before the mean."""
+    def loss(post, prior, balance=0.8, free_nats=1.0):
+        value = real(post, prior, balance, free_nats)[1]
+        return value.clamp(min=free_nats).mean(), value
+    return loss
+
+
+def teacher_in_the_optimiser(real):
+    """The published code: the teacher's gradients on, its weights in the model's optimiser."""
+    def init(self, cfg, action_dim, device, teacher=None):
+        real(self, cfg, action_dim, device, teacher)
+        weights = list(teacher.requires_grad_(True).parameters())
+        self.optimizers["model"].param_groups[0]["params"] += weights
+    return init
+
+
+def teacher_trained_too(real):
+    """A distillation loss without the stop-gradient."""
+    def loss(z_disen, z_task):
+        log_p, log_q = z_disen.log_softmax(-1), z_task.log_softmax(-1)
+        return (log_p.exp() * (log_p - log_q)).sum((-1, -2)).mean()
+    return loss
+
+
+def own_value(real):
+    """v_t where v_{t+1} belongs."""
+    return lambda r, v, d, b, l=0.95: real(r, torch.cat([v[:1], v[:-1]]), d, v[-1], l)
+
+
+def seam_ignored(real):
+    """`is_first` does nothing."""
+    return lambda self, state, action, embed, first: real(self, state, action, embed, first & False)
+
+
+returns_checks = check_lambda_return_is_the_n_step_mixture, check_behaviour_losses_are_appendix_b
+distill_checks = check_distillation_scale, check_distillation_is_equation_3
+BUGS = {  # name: what is patched, the bug, the checks that must fail
+    "teacher in the optimiser": (
+        "Agent.__init__", teacher_in_the_optimiser, check_teacher_is_frozen),
+    "teacher not frozen": (
+        "freeze", lambda real: lambda encoder: encoder, check_teacher_is_frozen),
+    "teacher trained by the loss": (
+        "distillation_loss", teacher_trained_too, check_no_gradient_reaches_the_teacher),
+    "distillation averaged over time": (
+        "distillation_loss", lambda real: lambda p, q: real(p, q) / p.shape[1], *distill_checks),
+    "distillation in the wrong direction": (
+        "distillation_loss", lambda real: lambda p, q: real(q, p), distill_checks[1]),
+    "v_t for v_{t+1}": ("lambda_return", own_value, *returns_checks),
+    "reversed returns": (
+        "lambda_return", lambda real: lambda *args: real(*args).flip(0), *returns_checks),
+    "free nats before the mean": (
+        "rssm_kl_loss", free_nats_first, check_free_nats_act_on_the_mean),
+    "KL balance the wrong way round": (
+        "rssm_kl_loss", lambda real: lambda q, p, share, free: real(q, p, 1 - share, free),
+        check_kl_gradient_is_split),
+    "unclipped action": (
+        "clip_action", lambda real: lambda action: action, check_actions_stay_inside_the_bounds),
+    "eta stuck at its first step": (
+        "eta_schedule", lambda real: lambda step, *args: real(0, *args),
+        check_eta_falls_during_a_run),
+    "state kept across a seam": ("RSSM.step", seam_ignored, check_is_first_forgets_everything),
+}
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_a_planted_bug_is_caught(bug, monkeypatch):
+    """The real tests' checks pass, and each fails once the bug is in the production function."""
+    name, plant, *checks = BUGS[bug]
+    for check in checks:
+        check()
+    *owner, attribute = name.split(".")
+    owner = getattr(diswm, owner[0]) if owner else diswm
+    monkeypatch.setattr(owner, attribute, plant(getattr(owner, attribute)))
+    for check in checks:
+        with pytest.raises(AssertionError):
+            check()
