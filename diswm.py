@@ -78,6 +78,7 @@ class UserError(Exception):
         self.code = code
 
 # === Config =======================================================================================
+
 def flag(default, help, *, low=0, choices=None, free=False):
     """A Config field and its flag. low: the least number; free: may change on resuming."""
     meta = dict(help=help, low=low, choices=choices, free=free)
@@ -100,7 +101,8 @@ class Config:
     # Environment (section 4).
     action_repeat: int = flag(2, "env steps per decision (published)", low=1)
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
-    colors: str = flag("published", "box centres (published)", choices=("published", "original"))
+    colors: str = flag("published", "colour boxes around fixed centres, or the original colours "
+                       "(published; paper)", choices=("published", "original"))
     color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)")
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
@@ -116,7 +118,8 @@ class Config:
     eval_episodes: int = flag(10, "episodes per evaluation (published)", low=1)
     replay_capacity: int = flag(1_000_000, "rows kept in the replay (published)", low=1)
     # World model, Eqs. (1), (2), (4), (5).
-    encoder: str = flag("beta_vae", "conv: as in DreamerV2 (paper)", choices=("beta_vae", "conv"))
+    encoder: str = flag("beta_vae", "image encoder and decoder; conv: DreamerV2's (paper)",
+                        choices=("beta_vae", "conv"))
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1)
     cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1)
     stoch: int = flag(50, "size of the stochastic state (published)", low=1)
@@ -135,7 +138,8 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "form of Eq. (3) (paper; ours)", choices=("softmax", "gaussian"))
+    distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
+                        choices=("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
@@ -182,6 +186,7 @@ METHODS = {
 }
 
 # === Maths: pure functions of tensors =============================================================
+
 ACTION_LIMIT = 1 - 1e-6  # actions stay strictly inside (−1, 1)
 
 def gaussian_kl(mean_p, std_p, mean_q, std_q):
@@ -248,10 +253,12 @@ def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
         returns.append(target)
     return torch.stack(returns[::-1])                                         # back in time order
 
-def squared_error(target, prediction):  # −ln N(target; prediction, 1), less ½ ln 2π, elementwise
+def squared_error(target, prediction):
+    """−ln N(target; prediction, 1), less ½ ln 2π, elementwise."""
     return 0.5 * (target - prediction)**2
 
-def gaussian_sample(mean, std):  # a reparameterised draw: the gradient reaches mean and std
+def gaussian_sample(mean, std):
+    """A reparameterised draw: the gradient reaches mean and std."""
     return mean + std * torch.randn_like(std)
 
 def clip_action(action):
@@ -267,24 +274,29 @@ def normal_entropy(std):
     return (std.log() + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
 
 # === Networks =====================================================================================
+
 def stack(layer, sizes, shapes):
     """Layers from size to size, each with ELU behind; shapes: (kernel, stride, padding) of each."""
     return [part for n, m, shape in zip(sizes[:-1], sizes[1:], shapes, strict=True)
             for part in (layer(n, m, *shape), nn.ELU())]
 
-def mlp(inputs, units, layers, outputs):  # `layers` hidden layers with ELU, then a linear one
+def mlp(inputs, units, layers, outputs):
+    """`layers` hidden layers with ELU, then a linear one."""
     hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
     return nn.Sequential(*hidden, nn.Linear(units, outputs))
 
-def bounded_std(x):  # a standard deviation in (0.1, 2.1): 2 σ(x / 2) + 0.1
+def bounded_std(x):
+    """A standard deviation in (0.1, 2.1): 2 σ(x / 2) + 0.1."""
     return 2 * torch.sigmoid(x / 2) + 0.1
 
-def kaiming(module):  # Kaiming-normal weights and zero biases, for the β-VAE only (published)
+def kaiming(module):
+    """Kaiming-normal weights and zero biases, for the β-VAE only (published)."""
     if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
         nn.init.kaiming_normal_(module.weight)
         nn.init.zeros_(module.bias)
 
-def preprocess(image):  # uint8 (..., 64, 64, 3) → float (..., 3, 64, 64) in [−0.5, 0.5]
+def preprocess(image):
+    """uint8 (..., 64, 64, 3) → float (..., 3, 64, 64) in [−0.5, 0.5]"""
     return image.movedim(-1, -3).float() / 255 - 0.5
 
 class PerFrame(nn.Module):
@@ -368,28 +380,34 @@ class RSSM(nn.Module):
         self.post_net = mlp(deter + embed_dim, hidden, 1, 2 * stoch)
 
     @staticmethod
-    def feat(state):  # what decoder, heads, actor and critic see: [z_t, h_t], (..., S + D)
+    def feat(state):
+        """What decoder, heads, actor and critic see: [z_t, h_t], (..., S + D)"""
         return torch.cat([state["stoch"], state["deter"]], -1)
 
-    def initial(self, batch):  # the zero state for a batch
+    def initial(self, batch):
+        """The zero state for a batch."""
         return {key: self.norm.weight.new_zeros(batch, size) for key, size in self.sizes.items()}
 
-    def recur(self, state, action):  # h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm
+    def recur(self, state, action):
+        """h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm."""
         x = torch.cat([state["stoch"], action], -1) if self.action_dim else state["stoch"]
         gates = self.norm(self.gru(torch.cat([self.inputs(x), state["deter"]], -1)).float())
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         return torch.lerp(state["deter"], candidate, torch.sigmoid(update - 1))         # (B, D)
 
-    def draw(self, net, inputs, deter):  # a state around h_t: `net`'s distribution, a sample
+    def draw(self, net, inputs, deter):
+        """A state around h_t: `net`'s distribution, a sample."""
         mean, std = net(inputs).float().chunk(2, -1)
         std = bounded_std(std)
         return dict(deter=deter, mean=mean, std=std, stoch=gaussian_sample(mean, std))
 
-    def prior(self, deter):  # ẑ_t ~ p(ẑ_t | h_t)
+    def prior(self, deter):
+        """ẑ_t ~ p(ẑ_t | h_t)"""
         return self.draw(self.prior_net, deter, deter)
 
-    def posterior(self, deter, embed):  # z_t ~ q(z_t | h_t, embed_t)
+    def posterior(self, deter, embed):
+        """z_t ~ q(z_t | h_t, embed_t)"""
         return self.draw(self.post_net, torch.cat([deter, embed], -1), deter)
 
     def step(self, state, action, embed, is_first):
@@ -408,6 +426,7 @@ class RSSM(nn.Module):
         return post, self.prior(post["deter"])                                # all steps at once
 
 # === Video predictor and world model ==============================================================
+
 class VideoPredictor(nn.Module):
     """The action-free video prediction model of Eq. (1), trained by Eq. (2)."""
 
@@ -431,12 +450,14 @@ class VideoPredictor(nn.Module):
             return gaussian_sample(mean, (logvar / 2).exp()), dict(mean=mean, logvar=logvar)
         return self.encoder(image), {}
 
-    def forward(self, batch):  # filter → dict of embed, code, post, prior, feat
+    def forward(self, batch):
+        """Filter → dict of embed, code, post, prior, feat."""
         embed, code = self.encode(batch["image"])
         post, prior = self.rssm.observe(embed, batch.get("action"), batch["is_first"])
         return dict(embed=embed, code=code, post=post, prior=prior, feat=self.rssm.feat(post))
 
-    def terms(self, out, batch):  # loss terms of each step, (B, T), nats, but for the KL
+    def terms(self, out, batch):
+        """Loss terms of each step, (B, T), nats, but for the KL."""
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
         error = squared_error(batch["image"], self.decoder(out["feat"]))
         terms = dict(image=error.sum((-3, -2, -1)))
@@ -470,13 +491,16 @@ class WorldModel(VideoPredictor):
         self.reward = mlp(cfg.stoch + cfg.deter, cfg.units, 2, 1)
         self.discount = mlp(cfg.stoch + cfg.deter, cfg.units, 3, 1)
 
-    def predict_reward(self, feat):  # r̂, the mean of a unit Gaussian: (..., S + D) → (...,)
+    def predict_reward(self, feat):
+        """r̂, the mean of a unit Gaussian: (..., S + D) → (...,)"""
         return self.reward(feat).squeeze(-1).float()
 
-    def predict_discount(self, feat):  # the logit of γ̂: (..., S + D) → (...,)
+    def predict_discount(self, feat):
+        """The logit of γ̂: (..., S + D) → (...,)"""
         return self.discount(feat).squeeze(-1).float()
 
-    def terms(self, out, batch):  # those of Eq. (2), the reward's and the discount's, (B, T) each
+    def terms(self, out, batch):
+        """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
         reward = squared_error(batch["reward"], self.predict_reward(out["feat"]))
         # DEVIATION: the discount head of Eq. (4) is trained; the published code switches it off.
         logit, target = self.predict_discount(out["feat"]), self.cfg.gamma * batch["discount"]
@@ -484,6 +508,7 @@ class WorldModel(VideoPredictor):
         return super().terms(out, batch) | dict(reward=reward, discount=discount)
 
 # === Actor-critic: behaviour learning in imagination, appendix B ==================================
+
 class ActorCritic(nn.Module):
     """Actor π(a | s), critic v(s), and a slow copy of the critic that gives the targets."""
 
@@ -495,14 +520,17 @@ class ActorCritic(nn.Module):
         self.slow_critic = mlp(feat_dim, cfg.units, 3, 1).requires_grad_(False)   # only copied
         self.copy_critic()
 
-    def copy_critic(self):  # slow critic ← critic
+    def copy_critic(self):
+        """Slow critic ← critic."""
         self.slow_critic.load_state_dict(self.critic.state_dict())
 
-    def policy(self, feat):  # → mean in (−1, 1) and std of the normal of actions, (..., A)
+    def policy(self, feat):
+        """→ mean in (−1, 1) and std of the normal of actions, (..., A)"""
         mean, std = self.actor(feat).float().chunk(2, -1)
         return torch.tanh(mean), bounded_std(std)
 
-    def value(self, feat, slow=False):  # v(s): (..., S + D) → (...,)
+    def value(self, feat, slow=False):
+        """v(s): (..., S + D) → (...,)"""
         return (self.slow_critic if slow else self.critic)(feat).squeeze(-1).float()
 
     def imagine(self, model, start):
@@ -557,7 +585,8 @@ def freeze(encoder):
     # DEVIATION: the published code switches the teacher's gradients back on and trains it along.
     return encoder.eval().requires_grad_(False)
 
-def adam(module, lr):  # the optimiser of a module's parameters (published)
+def adam(module, lr):
+    """The optimiser of a module's parameters (published)."""
     return torch.optim.Adam(module.parameters(), lr=lr, eps=1e-5)
 
 def autocast(cfg):
@@ -565,7 +594,8 @@ def autocast(cfg):
     # 1.5× of a whole step on a CPU with native bf16.
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
 
-def to_device(batch, device):  # numpy arrays → tensors on the device, images preprocessed
+def to_device(batch, device):
+    """Numpy arrays → tensors on the device, images preprocessed."""
     batch = {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
     return batch | {"image": preprocess(batch["image"])}
 
@@ -606,7 +636,8 @@ class Agent:
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
 
-    def teach(self, image):  # what the frozen teacher sees: embed, mean, logvar; or None
+    def teach(self, image):
+        """What the frozen teacher sees: embed, mean, logvar; or None."""
         if self.teacher is None:
             return None
         with torch.no_grad():                                                 # its knowledge stays
@@ -652,12 +683,14 @@ class Agent:
             optimizer.load_state_dict(state["optimizers"][name])
 
 # === Replay and video sets: episodes on disk ======================================================
+
 # A row holds an image and what led to it (see RSSM for how rows line up).
 ROW = dict(image=np.uint8, action=np.float32, reward=np.float32, discount=np.float32,
            is_first=np.bool_, is_terminal=np.bool_)
 VIDEO_KEYS = ("image", "is_first")  # all that a video predictor may see
 
-def make_row(image, action, reward=0.0, terminal=False, first=False):  # one row of an episode
+def make_row(image, action, reward=0.0, terminal=False, first=False):
+    """One row of an episode."""
     return dict(image=image, action=action, reward=reward, discount=1.0 - terminal, is_first=first,
                 is_terminal=terminal)
 
@@ -728,14 +761,16 @@ class Replay:
         last = self.paths[-1].stem if self.paths else ""
         self.next_index = int(last) + 1 if last.isdigit() else 0
 
-    def _hold(self, episodes):  # index (path, layout) pairs, less the oldest beyond capacity
+    def _hold(self, episodes):
+        """Index (path, layout) pairs, less the oldest beyond capacity."""
         lengths = [layout["image"][2][0] for _, layout in episodes]
         while self.capacity and sum(lengths[1:]) >= self.capacity:
             del episodes[0], lengths[0]
         self.episodes, self.ends = episodes, np.cumsum(lengths).tolist()
         self.paths, self.rows = [path for path, _ in episodes], sum(lengths)
 
-    def add(self, rows):  # append a finished episode, a list of `make_row`
+    def add(self, rows):
+        """Append a finished episode, a list of `make_row`."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{self.next_index:06d}.npz"
         with atomic(path) as file:
@@ -743,15 +778,18 @@ class Replay:
         self._hold([*self.episodes, (path, npz_layout(path, self.keys))])
         self.next_index += 1
 
-    def prune(self):  # delete files not in the index, once no checkpoint needs them
+    def prune(self):
+        """Delete files not in the index, once no checkpoint needs them."""
         for path in set(self.folder.glob("*.npz")) - set(self.paths):
             path.unlink()
 
-    def state_dict(self):  # which episodes there are: the first one and the next to come
+    def state_dict(self):
+        """Which episodes there are: the first one and the next to come."""
         first = int(self.paths[0].stem) if self.paths else self.next_index
         return dict(first=first, next=self.next_index)
 
-    def load_state_dict(self, state):  # later episodes, of a run cut off, go
+    def load_state_dict(self, state):
+        """Return to those episodes; later ones, of a run cut off, go."""
         first, self.next_index = state["first"], state["next"]
         numbers = {f"{number:06d}" for number in range(first, self.next_index)}
         self._hold([episode for episode in self.episodes if episode[0].stem in numbers])
@@ -759,7 +797,8 @@ class Replay:
             raise UserError(f"{self.folder} lacks episodes of its checkpoint; start over: --fresh")
         self.prune()
 
-    def window(self, start, length):  # rows start … start + length − 1: dict of (T, ...)
+    def window(self, start, length):
+        """Rows start … start + length − 1: dict of (T, ...)"""
         pieces = {key: [] for key in self.keys}
         while length > 0:
             index = np.searchsorted(self.ends, start, "right")
@@ -772,7 +811,8 @@ class Replay:
             start, length = start + count, length - count
         return {key: np.concatenate(piece) for key, piece in pieces.items()}
 
-    def sample(self, batch_size, length, rng):  # dict of (B, T, ...); windows begin is_first
+    def sample(self, batch_size, length, rng):
+        """Dict of (B, T, ...); windows begin is_first."""
         starts = rng.integers(0, self.rows - length + 1, batch_size)
         windows = [self.window(int(start), length) for start in starts]
         batch = {key: np.stack([window[key] for window in windows]) for key in self.keys}
@@ -800,6 +840,7 @@ def open_videos(folder, cache):
     return Replay(cache, keys=VIDEO_KEYS)
 
 # === Environments =================================================================================
+
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
@@ -826,7 +867,8 @@ class DMControlEnv(gym.Env):
             self.env.task.random.seed(seed)
         return self.env.reset().observation["observations"], {}
 
-    def step(self, action):  # a time limit truncates, only a zero discount terminates
+    def step(self, action):
+        """A time limit truncates, only a zero discount terminates."""
         step = self.env.step(action)
         obs, terminated = step.observation["observations"], step.last() and step.discount == 0
         return obs, float(step.reward), terminated, step.last() and not terminated, {}
@@ -838,7 +880,8 @@ class ActionRepeat(gym.Wrapper):
         super().__init__(env)
         self.n = n
 
-    def step(self, action):  # stops early where the episode ends
+    def step(self, action):
+        """Stops early where the episode ends."""
         # DEVIATION: the published code repeats in two wrappers (really 4) and doubles rewards.
         total, steps, terminated, truncated = 0.0, 0, False, False
         while steps < self.n and not (terminated or truncated):
@@ -869,7 +912,8 @@ class ColorDistractor(gym.Wrapper):
         self.original = self.unwrapped.model.mat_rgba[:, :3].copy()
         self.rng = np.random.default_rng()
 
-    def reset(self, *, seed=None, options=None):  # new colours; a seed determines them
+    def reset(self, *, seed=None, options=None):
+        """New colours; a seed determines them."""
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
         self.phase = (options or {}).get("phase", self.phase)
@@ -877,7 +921,8 @@ class ColorDistractor(gym.Wrapper):
         self.unwrapped.model.mat_rgba[:, :3] = self.rng.uniform(*self.box)
         return self.env.reset(seed=seed, options=options)
 
-    def step(self, action):  # optionally, the colours walk at random within the box
+    def step(self, action):
+        """Optionally, the colours walk at random within the box."""
         rgb = self.unwrapped.model.mat_rgba[:, :3]
         if self.step_std:
             rgb[:] = np.clip(rgb + self.rng.normal(0, self.step_std, rgb.shape), *self.box)
@@ -906,7 +951,8 @@ class Pixels(gym.ObservationWrapper):
     def render(self):
         return self.observation(None)
 
-    def close(self):  # free the GL context, then the simulator
+    def close(self):
+        """Free the GL context, then the simulator."""
         atexit.unregister(self.renderer.close)
         self.renderer.close()
         super().close()
@@ -934,12 +980,14 @@ def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colo
     env.reset(seed=seed)
     return env
 
-def config_env(cfg, task, phase, **kwargs):  # make_env with the values of a Config
+def config_env(cfg, task, phase, **kwargs):
+    """Make_env with the values of a Config."""
     return make_env(task, phase=phase, action_repeat=cfg.action_repeat, time_limit=cfg.time_limit,
                     colors=cfg.colors, color_range=cfg.color_range, fast_render=cfg.fast_render,
                     color_step_std=cfg.color_step_std, **kwargs)
 
-def episode_seed(seed, stream, index):  # of the run's seed, the purpose and the index
+def episode_seed(seed, stream, index):
+    """Of the run's seed, the purpose and the index."""
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
 
 def play_episode(env, policy, seed, phase, each=None):
@@ -956,11 +1004,13 @@ def play_episode(env, policy, seed, phase, each=None):
         done = bool(each and each(info)) or terminated or truncated
     return rows
 
-def random_policy(env, seed):  # uniform actions in [−1, 1]
+def random_policy(env, seed):
+    """Uniform actions in [−1, 1]"""
     rng = np.random.default_rng(seed)
     return lambda image, action, state: (rng.uniform(-1, 1, action.shape).astype(np.float32), None)
 
-def agent_policy(agent, explore):  # the agent's actor: sampled when exploring, else its mode
+def agent_policy(agent, explore):
+    """The agent's actor: sampled when exploring, else its mode."""
 
     def policy(image, action, state):
         actions, state = agent.act(image[None], action[None], state, explore)
@@ -968,6 +1018,7 @@ def agent_policy(agent, explore):  # the agent's actor: sampled when exploring, 
     return policy
 
 # === Runs: folders, checkpoints, logs, and the training loop ======================================
+
 def run_folder(cfg, stage):
     """runs/<stage>/<tasks>/<method>/seed<k>, so that the same command finds its run again."""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
@@ -1005,7 +1056,8 @@ class Run:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
 
-    def save(self, trainer):  # write the checkpoint, whole or not at all
+    def save(self, trainer):
+        """Write the checkpoint, whole or not at all."""
         self.folder.mkdir(parents=True, exist_ok=True)
         config, cpu = dataclasses.asdict(self.cfg), torch.get_rng_state()
         cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
@@ -1017,7 +1069,8 @@ class Run:
             file.write(buffer.getbuffer())
         (self.folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
 
-    def restore(self, trainer):  # trainer, random numbers, and the log as it was then
+    def restore(self, trainer):
+        """Trainer, random numbers, and the log as it was then."""
         trainer.load_state_dict(self.state["trainer"])
         torch.set_rng_state(self.state["rng"]["cpu"])
         if self.state["rng"]["cuda"] is not None and self.cfg.device == "cuda":
@@ -1091,14 +1144,16 @@ class VideoTrainer(Trainer):
         self.optimizer = adam(self.model, cfg.model_lr)
         self.progress, self.total = 0, cfg.pretrain_updates
 
-    def update(self, batch):  # one step of Eq. (2) on numpy arrays (B, T, ...) → metrics
+    def update(self, batch):
+        """One step of Eq. (2) on numpy arrays (B, T, ...) → metrics."""
         batch = to_device(batch, self.device)
         with autocast(self.cfg):
             loss, metrics = self.model.loss(self.model(batch), batch)
         norm = gradient_step(self.optimizer, loss, metrics, self.cfg.grad_clip)
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
 
-    def advance(self):  # some updates → a row of the log
+    def advance(self):
+        """Some updates → a row of the log."""
         metrics, cfg = [], self.cfg
         for _ in range(min(self.chunk, self.total - self.progress)):
             rng = np.random.default_rng([cfg.seed, self.progress])            # nothing to save
@@ -1126,16 +1181,19 @@ class AgentTrainer(Trainer):
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
 
     @property
-    def phase(self):  # the colours of an episode that starts now: they switch once, at the midpoint
+    def phase(self):
+        """The colours of an episode that starts now: they switch once, at the midpoint."""
         return "train" if self.progress < self.switch_step else "shifted"
 
-    def updates_due(self):  # how many updates follow the decision just made
+    def updates_due(self):
+        """How many updates follow the decision just made."""
         cfg = self.cfg
         if self.decisions < cfg.prefill or self.replay.rows < cfg.batch_length:
             return 0
         return int(self.decisions % cfg.train_every == 0) if self.updates else cfg.first_updates
 
-    def learn(self):  # do the updates that are due → a list of their metrics
+    def learn(self):
+        """Do the updates that are due → a list of their metrics."""
         cfg, metrics = self.cfg, []
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
@@ -1162,7 +1220,8 @@ class AgentTrainer(Trainer):
             return self.progress >= limit
         return play_episode(self.env, policy, seed, self.phase, each), metrics
 
-    def advance(self):  # an episode, and an evaluation when one is due → a row of the log
+    def advance(self):
+        """An episode, and an evaluation when one is due → a row of the log."""
         cfg, phase, before = self.cfg, self.phase, self.progress
         rows, metrics = self.play()
         self.replay.add(rows)
@@ -1177,10 +1236,12 @@ class AgentTrainer(Trainer):
                         eval_std=statistics.pstdev(returns))
         return row
 
-    def saved(self):  # a checkpoint was written: episodes that only the one before needed can go
+    def saved(self):
+        """A checkpoint was written: episodes that only the one before needed can go."""
         self.replay.prune()
 
-    def state_dict(self):  # and the teacher, so that the run needs no other file
+    def state_dict(self):
+        """And the teacher, so that the run needs no other file."""
         teacher = self.agent.teacher
         if teacher:
             teacher = dict(depth=teacher.net[0].out_channels, weights=teacher.state_dict())
@@ -1201,7 +1262,9 @@ def evaluate_agent(cfg, agent, env, phase):
     return returns, first
 
 # === Stages =======================================================================================
-def announce(cfg, stage, folder, frames):  # what runs, on what, its needs and folder
+
+def announce(cfg, stage, folder, frames):
+    """What runs, on what, its needs and folder."""
     disk = 0.1 + frames * 12.35e-6                                            # GB; a row is 12.3 kB
     memory = 0.8 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 2e-5
     print(f"{stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
@@ -1246,7 +1309,8 @@ def pretrain(cfg, fresh=False):
     torch.manual_seed(cfg.seed)
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
-def finetune(cfg, fresh=False):  # stage 3: distil, adapt, learn behaviour in the target task
+def finetune(cfg, fresh=False):
+    """Stage 3: distil, adapt, learn behaviour in the target task."""
     train_agent(cfg, "finetune", fresh)
 
 def find_teacher(cfg, device):
@@ -1322,9 +1386,11 @@ def evaluate(folder, device, episodes=None):
           f"{len(returns)} episodes each\nwrote evaluation.json and evaluation.mp4 in {folder}")
 
 # === Figures ======================================================================================
+
 TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
 
-def to_picture(image):  # float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)
+def to_picture(image):
+    """float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)"""
     return ((image.movedim(-3, -1) + 0.5).clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 @torch.no_grad()
@@ -1433,6 +1499,7 @@ def plot(folders, path):
     print(f"wrote {path}")
 
 # === Doctor and bench =============================================================================
+
 def doctor(cfg):
     """Print versions and device; render a frame of each env family in each phase to doctor.png."""
     print(f"python {platform.python_version()}  torch {torch.__version__}  mujoco "
@@ -1445,10 +1512,12 @@ def doctor(cfg):
     Path(cfg.runs).mkdir(parents=True, exist_ok=True)
     draw_grid(np.array([pictures]), [cfg.dst], PHASES, Path(cfg.runs) / "doctor.png")
 
-def median_ms(function, repeats=5):  # median wall time of a call, after one to warm up
+def median_ms(function, repeats=5):
+    """Median wall time of a call, after one to warm up."""
     return 1e3 * statistics.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
 
-def parameter_counts(agent):  # numbers of parameters by part, and in total
+def parameter_counts(agent):
+    """Numbers of parameters by part, and in total."""
     parts = dict(world_model=agent.model, teacher=agent.teacher, actor=agent.behaviour.actor,
                  critic=agent.behaviour.critic, slow_critic=agent.behaviour.slow_critic)
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
@@ -1479,6 +1548,7 @@ def bench(cfg):
           f"{'peak memory':14}{peak:>11.0f} MiB", sep="\n  ")
 
 # === Command line =================================================================================
+
 COMMANDS = dict(
     collect="learn in the distracting source task; the replay is the video set",
     pretrain="train the β-VAE video predictor (collects videos first if there are none)",
@@ -1497,7 +1567,8 @@ class Parser(argparse.ArgumentParser):
         hint = f"there are: {flags}" if "unrecognized" in message else f"see: {self.prog} --help"
         self.exit(2, f"error: {message}; {hint}\n")
 
-def number(kind, low):  # a parser of numbers of a type that are finite and at least `low`
+def number(kind, low):
+    """A parser of numbers of a type that are finite and at least `low`."""
 
     def parse(text):
         if not low <= kind(text) < math.inf:
