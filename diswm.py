@@ -1472,12 +1472,16 @@ def read_log(folder):
 def plot(folders, path):
     """Evaluation returns of runs …/<tasks>/<method>/seed<k>: mean and spread over seeds."""
     from matplotlib.figure import Figure  # slow to import
-    curves = {}                                           # {tasks: {method: [{step: return}]}}
+    curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
     for folder in map(Path, folders):
-        curve = {r["step"]: r["eval_return"] for r in read_log(folder) if "eval_return" in r}
+        rows = read_log(folder)
+        curve = {row["step"]: row["eval_return"] for row in rows if "eval_return" in row}
         if curve:
             *_, tasks, method, _ = folder.resolve().parts
             curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
+            last = {row["phase"]: row["step"] for row in rows}                # of each phase
+            if len(last) > 1:
+                switches[tasks] = last["train"]
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
     figure = Figure(figsize=(5.5 * len(curves), 3.8))
@@ -1490,6 +1494,8 @@ def plot(folders, path):
             line, = axes.plot(steps, mean, marker=".", label=f"{method}, {len(runs)} seed(s)")
             color = line.get_color()
             axes.fill_between(steps, mean - spread, mean + spread, alpha=0.2, color=color)
+        if tasks in switches:
+            axes.axvline(switches[tasks], color="gray", ls=":", label="the colours change")
         axes.set(title=tasks.replace("-", " → "), xlabel="env steps", ylabel="evaluation return",
                  ylim=(0, None))
         axes.legend()
