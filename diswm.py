@@ -34,6 +34,7 @@ import contextlib
 import ctypes
 import dataclasses
 import difflib
+import functools
 import io
 import json
 import math
@@ -106,6 +107,7 @@ class Config:
     color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)")
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
+    envs: int = flag(1, "environments side by side, beyond one a process each (ours)", low=1)
     # How long.
     steps: int = flag(1_000_000, "env steps of finetuning (paper)", low=1)
     collect_steps: int = flag(2_000_000, "env steps of collecting: 1M frames (paper)", low=1)
@@ -143,7 +145,8 @@ class Config:
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
-    eta_delay: int = flag(0, "decisions before it; 50 000 across domains (published)")
+    eta_delay: int = flag(-1, "decisions before it; -1: eta_decay across domains, else 0 "
+                          "(published)", low=-1)
     # Behaviour, appendix B.
     horizon: int = flag(15, "imagined transitions, H (table)", low=1)
     imagine_starts: int = flag(0, "states of a batch to imagine from; 0: all (ours)")
@@ -841,10 +844,34 @@ def open_videos(folder, cache):
 
 # === Environments =================================================================================
 
+vars(np).setdefault("in1d", np.isin)  # NumPy 2.4 dropped it; dm_control's quadruped calls it
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
+OTHER_TASKS = ("pusher", "drawer_open", "drawer_close")
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
+TABLE_TOPS = dict(train="grid", shifted="wood", eval="metal")  # DrawerWorld
+# Views from above: the published one; ours, with which the whole drawer of version 3 is visible.
+CAMERAS = dict(pusher=dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2)),
+               drawer=dict(distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0)))
 TRAINING, EVALUATION = 0, 1  # streams of episode_seed
+
+def family(task):
+    """Between two of "dmc", "pusher", "drawer" and "gymnasium", a transfer crosses domains."""
+    return ("dmc" if task in TASKS else
+            task.split("_")[0] if task in OTHER_TASKS else "gymnasium")
+
+def check_task(task):
+    """Raise UserError with the nearest names unless there is such a task."""
+    if task not in TASKS and task not in OTHER_TASKS and task not in gym.registry:
+        with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
+            import gymnasium_robotics  # noqa: F401  registers its tasks, and prints a notice
+    if task not in TASKS and task not in OTHER_TASKS and task not in gym.registry:
+        ours = [*TASKS, *OTHER_TASKS]
+        ids = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(
+            ("gymnasium.envs.mujoco", "gymnasium_robotics"))]
+        near = " or ".join(difflib.get_close_matches(task, ours + ids)) or "none is similar"
+        raise UserError(f"unknown '{task}' ({near}); there are: {', '.join(ours)}, and Gymnasium's "
+                        "MuJoCo tasks, such as HalfCheetah-v5 or FetchReach-v4", code=2)
 
 class DMControlEnv(gym.Env):
     """A task of dm_control.suite as a gymnasium.Env with a flat state observation."""
@@ -873,8 +900,55 @@ class DMControlEnv(gym.Env):
         obs, terminated = step.observation["observations"], step.last() and step.discount == 0
         return obs, float(step.reward), terminated, step.last() and not terminated, {}
 
+def drawer_world(task):
+    """DrawerWorld: a Meta-World task with three table tops; reset(options={"phase": …}) chooses.
+    Rewards and drawer are those of version 3, the only one left; version 1 is the original's."""
+    import metaworld  # takes a second
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+    folder = Path(metaworld.__file__).parent / "assets" / "textures"
+    checker = dict(builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, width=300, height=300,
+                   mark=mujoco.mjtMark.mjMARK_EDGE, rgb1=(0.1, 0.2, 0.3), rgb2=(0.2, 0.3, 0.4))
+
+    class DrawerWorld(ALL_V3_ENVIRONMENTS[task.replace("_", "-") + "-v3"]):
+        def _initialize_simulation(self):
+            spec = mujoco.MjSpec.from_file(self.fullpath)
+            for name in TABLE_TOPS.values():
+                source = checker if name == "grid" else dict(file=str(folder / f"{name}.png"))
+                spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, **source)
+                material = spec.add_material(name=name, texrepeat=(1, 1), texuniform=True)
+                material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+            model = spec.compile()
+            model.mat_reflectance[:] = 0  # 17 ms a frame, for no visible difference
+            self.top = model.body("tablelink").geomadr[0]                     # a box on the legs
+            self.materials = {phase: model.mat(name).id for phase, name in TABLE_TOPS.items()}
+            self.materials["none"] = model.geom_matid[self.top]
+            return model, mujoco.MjData(model)
+
+        def reset(self, *, seed=None, options=None):
+            if seed is not None:
+                self.seed(seed)                                               # reset ignores it
+            self.model.geom_matid[self.top] = self.materials[options["phase"]]
+            result = super().reset()
+            mujoco.mj_forward(self.model, self.data)  # else one sees the drawer where it was before
+            return result
+    env = DrawerWorld()
+    # Its own benchmark sets a goal from a list; this draws one at each reset, from the seed.
+    env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
+    return env
+
+def bare_simulator(task):
+    """A task's simulator without wrappers → (env with `model` and `data`, steps per episode)."""
+    if task in TASKS:
+        return DMControlEnv(*TASKS[task]), 1000
+    if task in OTHER_TASKS and task != "pusher":
+        return drawer_world(task), 200                                        # DrawerWorld's own
+    name = "Pusher-v5" if task == "pusher" else task
+    env = gym.make(name, disable_env_checker=True, max_episode_steps=-1).unwrapped
+    return env, gym.spec(name).max_episode_steps
+
 class ActionRepeat(gym.Wrapper):
-    """Hold an action for n simulator steps, sum the rewards; info["env_steps"] counts the steps."""
+    """Hold an action for n simulator steps, sum the rewards; info["env_steps"] counts the steps.
+    info["success"], where the task tells, is true if it was reached at any of them."""
 
     def __init__(self, env, n):
         super().__init__(env)
@@ -883,69 +957,120 @@ class ActionRepeat(gym.Wrapper):
     def step(self, action):
         """Stops early where the episode ends."""
         # DEVIATION: the published code repeats in two wrappers (really 4) and doubles rewards.
-        total, steps, terminated, truncated = 0.0, 0, False, False
+        total, steps, terminated, truncated, reached = 0.0, 0, False, False, []
         while steps < self.n and not (terminated or truncated):
             obs, reward, terminated, truncated, info = self.env.step(action)
             total, steps = total + reward, steps + 1
-        return obs, total, terminated, truncated, info | {"env_steps": steps}
+            reached += [info[key] for key in ("success", "is_success") if key in info]
+        info = info | {"env_steps": steps} | ({"success": any(reached)} if reached else {})
+        return obs, total, terminated, truncated, info
 
 def color_box(phase, original, colors="published", half_range=0.2):
     """What a phase draws colours from: (low, high), each (n, 3) in 0..1, like `original`.
     Around the original colours, `shifted` rotates their channels (ours)."""
     if phase == "none":
         return original, original
-    phase = "shifted" if phase == "eval" else phase                           # DMC keeps none apart
+    phase = "shifted" if phase == "eval" else phase                           # not kept apart
     if colors == "published":
         center = np.broadcast_to(COLOR_CENTERS[phase], original.shape)
     else:
         center = original if phase == "train" else np.roll(original, 1, -1)
     return np.clip(center - half_range, 0, 1), np.clip(center + half_range, 0, 1)
 
+def color_groups(task, model):
+    """What the distractor colours: (RGBA array, rows that share a colour) pairs."""
+    if task in TASKS:
+        return [(model.mat_rgba, [i]) for i in range(model.nmat)]
+    if family(task) == "drawer":
+        return []                                                             # textures instead
+    if task == "pusher":                                                      # published
+        arm = [model.geom(name).id for name in ("uar", "ua", "ef", "sp", "fa", "sl", "e1", "e2")]
+        thing, table = model.body("object").geomadr[0], model.geom("table").id
+        return [(model.geom_rgba, rows) for rows in ([thing], [table], arm)]
+    # MuJoCo shows a geom's material where there is one and its own colour is the default.
+    own = (model.geom_matid < 0) | (model.geom_rgba != (0.5, 0.5, 0.5, 1)).any(1)
+    return [*((model.mat_rgba, [i]) for i in np.unique(model.geom_matid[~own])),
+            *((model.geom_rgba, [i]) for i in np.flatnonzero(own))]
+
 class ColorDistractor(gym.Wrapper):
-    """Each episode, draw the colours of all materials from a random stream of their own.
+    """Each episode, draw the colours of groups from a random stream of their own.
     reset(options={"phase": …}) changes the phase from then on. Only what is rendered changes."""
 
-    def __init__(self, env, phase, colors="published", half_range=0.2, step_std=0.0):
+    def __init__(self, env, task, phase, colors="published", half_range=0.2, step_std=0.0):
         super().__init__(env)
         self.phase, self.colors = phase, colors
         self.half_range, self.step_std = half_range, step_std
-        self.original = self.unwrapped.model.mat_rgba[:, :3].copy()
+        self.groups = color_groups(task, self.unwrapped.model)
+        self.original = self.look()
+        self.black = int(task == "pusher")  # how many groups are always black (published)
         self.rng = np.random.default_rng()
+
+    def look(self):
+        """The colours now: of each group, those of its rows."""
+        return [array[rows, :3] for array, rows in self.groups]
+
+    def paint(self, colors):
+        """Give each group its colour or, from look(), its colours."""
+        for (array, rows), color in zip(self.groups, colors, strict=True):
+            array[rows, :3] = color
 
     def reset(self, *, seed=None, options=None):
         """New colours; a seed determines them."""
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
         self.phase = (options or {}).get("phase", self.phase)
-        self.box = color_box(self.phase, self.original, self.colors, self.half_range)
-        self.unwrapped.model.mat_rgba[:, :3] = self.rng.uniform(*self.box)
-        return self.env.reset(seed=seed, options=options)
+        if self.phase == "none":
+            self.paint(self.original)
+        else:
+            first = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
+            self.box = color_box(self.phase, first, self.colors, self.half_range)
+            for bound in self.box:
+                bound[:self.black] = 0
+            self.paint(self.rng.uniform(*self.box))
+        return self.env.reset(seed=seed, options=(options or {}) | {"phase": self.phase})
 
     def step(self, action):
         """Optionally, the colours walk at random within the box."""
-        rgb = self.unwrapped.model.mat_rgba[:, :3]
-        if self.step_std:
-            rgb[:] = np.clip(rgb + self.rng.normal(0, self.step_std, rgb.shape), *self.box)
+        if self.step_std and self.phase != "none":
+            rgb = np.array([rgb[0] for rgb in self.look()]).reshape(-1, 3)
+            self.paint(np.clip(rgb + self.rng.normal(0, self.step_std, rgb.shape), *self.box))
         return self.env.step(action)
 
 class Pixels(gym.ObservationWrapper):
-    """Observe what camera 0 sees, uint8 (size, size, 3), through a renderer of one's own.
+    """Observe what a camera sees, uint8 (size, size, 3), through a renderer of one's own.
+    camera: of the model, or the properties of a free one.
     mujoco.Renderer makes its GL context current before each use; the simulators' render() does not,
     and then two of them in one process silently show each other's textures."""
     metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
 
-    def __init__(self, env, size=64, fast=False):
+    def __init__(self, env, camera=0, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
-        quality = self.unwrapped.model.vis.quality
+        model, self.camera = self.unwrapped.model, camera
+        if isinstance(camera, dict):
+            self.camera = mujoco.MjvCamera()
+            mujoco.mjv_defaultFreeCamera(model, self.camera)
+            for key, value in camera.items():
+                setattr(self.camera, key, value)
+        quality = model.vis.quality
         quality.shadowsize = 512          # 20–60 % of a frame, for a mean difference < 0.2 / 255
         if fast:
             quality.offsamples = 0        # half of the rest, for 1–2 / 255
-        self.renderer = mujoco.Renderer(self.unwrapped.model, size, size)
+        self.renderer = mujoco.Renderer(model, size, size)
         atexit.register(self.renderer.close)  # one that is open at exit prints GL errors
 
+    def reset(self, *, seed=None, options=None):
+        """The terrain of quadruped_escape is another one in each episode."""
+        _, info = self.env.reset(seed=seed, options=options)
+        for index in range(self.unwrapped.model.nhfield):
+            self.renderer._gl_context.make_current()
+            mujoco.mjr_uploadHField(self.unwrapped.model, self.renderer._mjr_context, index)
+        return self.observation(None), info
+
     def observation(self, observation):
-        self.renderer.update_scene(self.unwrapped.data, camera=0)
+        if hasattr(self.unwrapped, "_render_callback"):
+            self.unwrapped._render_callback()                                 # puts Fetch's goal
+        self.renderer.update_scene(self.unwrapped.data, camera=self.camera)
         return self.renderer.render()
 
     def render(self):
@@ -957,72 +1082,119 @@ class Pixels(gym.ObservationWrapper):
         self.renderer.close()
         super().close()
 
+def default_camera(task, env):
+    """Where a task is seen from: as published, or as its own library shows it."""
+    if task in TASKS:
+        return 0
+    track = mujoco.mj_name2id(env.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    renderer = getattr(env, "mujoco_renderer", None)
+    config = CAMERAS.get(family(task)) or getattr(renderer, "default_cam_config", None) or {}
+    return track if track >= 0 else config
+
 def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colors="published",
              color_range=0.2, color_step_std=0.0, fast_render=False, size=64, pixels=True):
     """The one env stack: simulator, actions in [−1, 1], time limit, action repeat, colours, pixels.
-    phase: "train", "shifted" (colours after the midpoint), "eval" (those that a finished run is
-    judged in; on DMC the shifted ones) or "none" (the task's own). time_limit: simulator steps, 0
-    for the task's own. pixels=False leaves the state observation and renders nothing. Returns a
-    gymnasium.Env of uint8 (size, size, 3) images. UserError: unknown task or phase, no OpenGL."""
-    if task not in TASKS or phase not in PHASES:
-        wrong, known = (task, TASKS) if task not in TASKS else (phase, PHASES)
-        near = " or ".join(difflib.get_close_matches(wrong, known)) or "none is similar"
-        raise UserError(f"unknown '{wrong}' ({near}); there are: {', '.join(known)}", code=2)
-    env = gym.wrappers.RescaleAction(DMControlEnv(*TASKS[task]), np.float32(-1), np.float32(1))
-    env = ActionRepeat(gym.wrappers.TimeLimit(env, time_limit or 1000), action_repeat)  # DMC's 1000
-    env = ColorDistractor(env, phase, colors, color_range, color_step_std)
+    task: of dm_control, "pusher", "drawer_open", "drawer_close", or the id of a Gymnasium task with
+    a MuJoCo model and continuous actions. phase: "train", "shifted" (after the midpoint), "eval"
+    (those that a finished run is judged in; the shifted ones but for drawers) or "none" (the
+    task's own look). time_limit: simulator steps, 0 for the task's own. pixels=False leaves the
+    state observation, flat, and renders nothing. Returns a gymnasium.Env of uint8 (size, size, 3)
+    images. UserError: unknown task or phase, a task that does not fit, no OpenGL."""
+    check_task(task)
+    if phase not in PHASES:
+        raise UserError(f"unknown phase '{phase}'; there are: {', '.join(PHASES)}", code=2)
+    try:
+        env, limit = bare_simulator(task)
+    except (gym.error.Error, ImportError, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise UserError(f"{task} cannot be made ({reason}); run: pip install --force-reinstall -r "
+                        "requirements.txt") from error
+    if not isinstance(getattr(env, "model", None), mujoco.MjModel):
+        raise UserError(f"{task} has no MuJoCo model to take pixels from; choose a MuJoCo task")
+    if not isinstance(env.action_space, gym.spaces.Box):
+        raise UserError(f"{task} has discrete actions; choose a task with continuous ones")
+    camera = default_camera(task, env)
+    env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+    if time_limit or limit:
+        env = gym.wrappers.TimeLimit(env, time_limit or limit)
+    env = ActionRepeat(env, action_repeat)
+    env = ColorDistractor(env, task, phase, colors, color_range, color_step_std)
     if pixels:
         try:
-            env = Pixels(env, size, fast_render)
+            env = Pixels(env, camera, size, fast_render)
         except (AttributeError, ImportError, RuntimeError) as error:
             raise UserError(f"MuJoCo with MUJOCO_GL={os.environ['MUJOCO_GL']} cannot render "
                             f"({error}); {GL_HINT}") from error
+    elif isinstance(env.observation_space, gym.spaces.Dict):
+        env = gym.wrappers.FlattenObservation(env)
     env.reset(seed=seed)
     return env
 
+if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its last lines
+    for name in (*TASKS, *OTHER_TASKS):
+        gym.register(f"DisWM/{name}-v0", "diswm:make_env", kwargs=dict(task=name))
+
 def config_env(cfg, task, phase, **kwargs):
-    """Make_env with the values of a Config."""
+    """make_env with the values of a Config."""
     return make_env(task, phase=phase, action_repeat=cfg.action_repeat, time_limit=cfg.time_limit,
                     colors=cfg.colors, color_range=cfg.color_range, fast_render=cfg.fast_render,
                     color_step_std=cfg.color_step_std, **kwargs)
+
+def config_envs(cfg, task, **kwargs):
+    """cfg.envs of them as a gymnasium.vector.VectorEnv: one in this process, several in others."""
+    make = [functools.partial(config_env, cfg, task, "train", **kwargs)] * cfg.envs
+    if cfg.envs == 1:
+        return gym.vector.SyncVectorEnv(make)
+    return gym.vector.AsyncVectorEnv(make, context="spawn")                   # EGL hangs in a fork
 
 def episode_seed(seed, stream, index):
     """Of the run's seed, the purpose and the index."""
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
 
-def play_episode(env, policy, seed, phase, each=None):
-    """Play one episode → its rows (see make_row).
-    policy(image, action, state) → (action, state), given the previous action and, at first, None.
-    each(info) is called after each decision; the episode is cut where it returns true."""
-    image, _ = env.reset(seed=seed, options=dict(phase=phase))
-    action, state, done = np.zeros(env.action_space.shape, np.float32), None, False
-    rows = [make_row(image, action, first=True)]
-    while not done:
-        action, state = policy(image, action, state)
-        image, reward, terminated, truncated, info = env.step(action)
-        rows.append(make_row(image, action, reward, terminated))
-        done = bool(each and each(info)) or terminated or truncated
-    return rows
+def play_episodes(envs, policy, seeds, phase, each=None):
+    """Play an episode in each environment → [(rows (see make_row), whether it succeeded), …].
+    policy(images, actions, state) → (actions, state), given the previous actions and, at first,
+    None. each(env steps) is called after each decision, with those of the environments that were
+    still playing, an array; all episodes are cut where it returns true. Success is None where the
+    task does not tell."""
+    images, _ = envs.reset(seed=seeds, options=dict(phase=phase))
+    actions, state = np.zeros(envs.action_space.shape, np.float32), None
+    episodes = [[make_row(*pair, first=True)] for pair in zip(images, actions, strict=True)]
+    playing, success = np.full(len(episodes), True), [None] * len(episodes)
+    while playing.any():
+        actions, state = policy(images, actions, state)
+        images, rewards, terminated, truncated, info = envs.step(actions)
+        for i in np.flatnonzero(playing):                                     # the rest start anew
+            row = make_row(images[i], actions[i], float(rewards[i]), bool(terminated[i]))
+            episodes[i].append(row)
+            if "success" in info:
+                success[i] = bool(success[i] or info["success"][i])
+        cut = bool(each and each(info["env_steps"][playing]))
+        playing &= ~(terminated | truncated | cut)
+    return list(zip(episodes, success, strict=True))
 
-def random_policy(env, seed):
-    """Uniform actions in [−1, 1]"""
-    rng = np.random.default_rng(seed)
-    return lambda image, action, state: (rng.uniform(-1, 1, action.shape).astype(np.float32), None)
+def random_policy(seeds):
+    """Uniform actions in [−1, 1], from a stream for each environment."""
+    rngs = [np.random.default_rng(seed) for seed in seeds]
+    return lambda images, actions, state: (
+        np.array([rng.uniform(-1, 1, actions.shape[1:]) for rng in rngs], np.float32), None)
 
 def agent_policy(agent, explore):
     """The agent's actor: sampled when exploring, else its mode."""
-
-    def policy(image, action, state):
-        actions, state = agent.act(image[None], action[None], state, explore)
-        return actions[0], state
-    return policy
+    return functools.partial(agent.act, explore=explore)
 
 # === Runs: folders, checkpoints, logs, and the training loop ======================================
+
+def eta_delay(cfg):
+    """Decisions before distillation begins: as set, or by the two tasks' families."""
+    if cfg.eta_delay >= 0:
+        return cfg.eta_delay
+    return 0 if family(cfg.src) == family(cfg.dst) else cfg.eta_decay
 
 def run_folder(cfg, stage):
     """runs/<stage>/<tasks>/<method>/seed<k>, so that the same command finds its run again."""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
-    return Path(cfg.runs) / stage / tasks / cfg.method / f"seed{cfg.seed}"
+    return Path(cfg.runs) / stage / tasks.replace("/", "_") / cfg.method / f"seed{cfg.seed}"
 
 def read_checkpoint(path):
     """A checkpoint, loaded without executing code. UserError when it is missing or not ours."""
@@ -1042,6 +1214,7 @@ class Run:
     """A run's folder: checkpoint.pt, config.json, metrics.jsonl, TensorBoard events."""
 
     def __init__(self, cfg, stage, fresh=False):
+        cfg = replace(cfg, eta_delay=eta_delay(cfg))
         self.cfg, self.stage, self.folder = cfg, stage, run_folder(cfg, stage)
         self.checkpoint = self.folder / "checkpoint.pt"
         self.log_path = self.folder / "metrics.jsonl"
@@ -1174,8 +1347,8 @@ class AgentTrainer(Trainer):
 
     def __init__(self, cfg, folder, device, teacher=None):
         self.cfg = cfg
-        self.env, self.eval_env = (config_env(cfg, cfg.dst, "train") for _ in range(2))
-        self.agent = Agent(cfg, self.env.action_space.shape[0], device, teacher)
+        self.envs = config_envs(cfg, cfg.dst)
+        self.agent = Agent(cfg, self.envs.single_action_space.shape[0], device, teacher)
         self.replay = Replay(folder / "episodes", cfg.replay_capacity)
         self.progress = self.decisions = self.updates = self.episodes = 0
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
@@ -1185,19 +1358,20 @@ class AgentTrainer(Trainer):
         """The colours of an episode that starts now: they switch once, at the midpoint."""
         return "train" if self.progress < self.switch_step else "shifted"
 
-    def updates_due(self):
-        """How many updates follow the decision just made."""
-        cfg = self.cfg
+    def updates_due(self, decisions):
+        """How many updates follow the decisions just made, one in each environment."""
+        cfg, before = self.cfg, self.decisions - decisions
         if self.decisions < cfg.prefill or self.replay.rows < cfg.batch_length:
             return 0
-        return int(self.decisions % cfg.train_every == 0) if self.updates else cfg.first_updates
+        due = self.decisions // cfg.train_every - before // cfg.train_every
+        return due if self.updates else cfg.first_updates
 
-    def learn(self):
-        """Do the updates that are due → a list of their metrics."""
+    def learn(self, decisions):
+        """Do the updates that are due after so many decisions → a list of their metrics."""
         cfg, metrics = self.cfg, []
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
-        eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
-        for _ in range(self.updates_due()):
+        eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, eta_delay(cfg))
+        for _ in range(self.updates_due(decisions)):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
             metrics.append(self.agent.update(batch, eta, self.updates, self.updates % 100 == 0))
@@ -1205,35 +1379,38 @@ class AgentTrainer(Trainer):
         return metrics
 
     def play(self):
-        """A training episode, learning on the way → its rows, and the metrics of its updates.
-        It ends with the simulator's episode, at the colour switch, or with the run."""
-        cfg, metrics = self.cfg, []
-        seed = episode_seed(cfg.seed, TRAINING, self.episodes)
-        random, actor = random_policy(self.env, seed), agent_policy(self.agent, explore=True)
+        """An episode in each environment, learning on the way → see play_episodes, and the metrics
+        of the updates. It ends with the simulator's, at the colour switch, or with the run."""
+        cfg, metrics, count = self.cfg, [], self.envs.num_envs
+        seeds = [episode_seed(cfg.seed, TRAINING, self.episodes + i) for i in range(count)]
+        random, actor = random_policy(seeds), agent_policy(self.agent, explore=True)
         limit = self.switch_step if self.progress < self.switch_step else self.total
         def policy(*args):
             return (random if self.decisions < cfg.prefill else actor)(*args)
-        def each(info):
-            self.decisions += 1
-            self.progress += info["env_steps"]
-            metrics.extend(self.learn())
+        def each(env_steps):
+            self.decisions += len(env_steps)
+            self.progress += int(env_steps.sum())
+            metrics.extend(self.learn(len(env_steps)))
             return self.progress >= limit
-        return play_episode(self.env, policy, seed, self.phase, each), metrics
+        return play_episodes(self.envs, policy, seeds, self.phase, each), metrics
 
     def advance(self):
-        """An episode, and an evaluation when one is due → a row of the log."""
+        """An episode in each environment, and an evaluation when one is due → a row of the log."""
         cfg, phase, before = self.cfg, self.phase, self.progress
-        rows, metrics = self.play()
-        self.replay.add(rows)
-        self.episodes += 1
-        total = math.fsum(row["reward"] for row in rows)
-        row = dict(step=self.progress, phase=phase, train_return=total, train_length=len(rows) - 1)
+        episodes, metrics = self.play()
+        for rows, _ in episodes:
+            self.replay.add(rows)
+        self.episodes += len(episodes)
+        result = summary(episodes)
+        row = dict(step=self.progress, phase=phase, train_return=result.pop("mean"),
+                   train_length=statistics.mean(len(rows) - 1 for rows, _ in episodes))
         row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
+        row |= {f"train_{key}": value for key, value in result.items() if key == "success"}
         due = self.progress // cfg.eval_every > before // cfg.eval_every
         if due or self.progress >= self.total:
-            returns, _ = evaluate_agent(cfg, self.agent, self.eval_env, phase)
-            row |= dict(eval_return=statistics.fmean(returns), eval_returns=returns,
-                        eval_std=statistics.pstdev(returns))
+            result = evaluate_agent(cfg, self.agent, self.envs, phase)
+            row |= dict(eval_return=result.pop("mean"))
+            row |= {f"eval_{key}": value for key, value in result.items()}
         return row
 
     def saved(self):
@@ -1247,19 +1424,33 @@ class AgentTrainer(Trainer):
             teacher = dict(depth=teacher.net[0].out_channels, weights=teacher.state_dict())
         return super().state_dict() | dict(teacher=teacher, action_dim=self.agent.action_dim)
 
-def evaluate_agent(cfg, agent, env, phase):
+def summary(episodes):
+    """Mean, list and standard deviation of their returns; share that succeeded, if known."""
+    returns = [math.fsum(row["reward"] for row in rows) for rows, _ in episodes]
+    result = dict(mean=statistics.fmean(returns), returns=returns, std=statistics.pstdev(returns))
+    known = [success for _, success in episodes if success is not None]
+    return result | (dict(success=statistics.fmean(known)) if known else {})
+
+def evaluation_phase(task, phase):
+    """Drawers are judged on the table top that training never shows, other tasks in `phase`."""
+    return "eval" if family(task) == "drawer" else phase
+
+def evaluate_agent(cfg, agent, envs, phase, keep=None):
     """Play `eval_episodes` episodes, the same seeds every time; agent None: random actions.
-    Returns their returns and the first one's rows. Training's random numbers stay untouched."""
-    returns, first = [], None
+    Returns their summary(). Training's random numbers stay untouched."""
+    phase = evaluation_phase(cfg.dst, phase)
+    episodes, count = [], envs.num_envs
     with torch.random.fork_rng():
         torch.manual_seed(cfg.seed)
-        for index in range(cfg.eval_episodes):
-            seed = episode_seed(cfg.seed, EVALUATION, index)
-            policy = agent_policy(agent, explore=False) if agent else random_policy(env, seed)
-            rows = play_episode(env, policy, seed, phase)
-            returns.append(math.fsum(row["reward"] for row in rows))
-            first = first or rows
-    return returns, first
+        for first in range(0, cfg.eval_episodes, count):
+            seeds = [episode_seed(cfg.seed, EVALUATION, first + i) for i in range(count)]
+            policy = agent_policy(agent, explore=False) if agent else random_policy(seeds)
+            played = play_episodes(envs, policy, seeds, phase)[:cfg.eval_episodes - first]
+            for rows, success in played:
+                if keep:
+                    keep(rows)
+                episodes.append(([dict(reward=row["reward"]) for row in rows], success))
+    return summary(episodes)
 
 # === Stages =======================================================================================
 
@@ -1280,7 +1471,7 @@ def train_agent(cfg, stage, fresh):
     announce(cfg, stage, run.folder, cfg.steps // cfg.action_repeat)
     torch.manual_seed(cfg.seed)
     trainer = AgentTrainer(cfg, run.folder, device, teacher)
-    with contextlib.closing(trainer.env), contextlib.closing(trainer.eval_env):
+    with contextlib.closing(trainer.envs):
         train(trainer, run)
     return run.folder
 
@@ -1370,20 +1561,26 @@ def evaluate(folder, device, episodes=None):
         raise UserError(f"{folder} is a video predictor without a policy; give a finetune run")
     cfg = replace(cfg, eval_episodes=episodes or cfg.eval_episodes)
     switched = trainer["progress"] >= int(cfg.switch * cfg.steps) < cfg.steps
-    result = dict(task=cfg.dst, phase="shifted" if switched else "train", step=trainer["progress"])
+    phase = evaluation_phase(cfg.dst, "shifted" if switched else "train")
+    result = dict(task=cfg.dst, phase=phase, step=trainer["progress"])
+    shutil.rmtree(folder / "evaluation", ignore_errors=True)
+    replay = Replay(folder / "evaluation")
     for name, policy in (("", agent), ("random_", None)):
         # Nobody looks at what the random policy sees.
-        with contextlib.closing(config_env(cfg, cfg.dst, "train", pixels=bool(policy))) as env:
-            returns, rows = evaluate_agent(cfg, policy, env, result["phase"])
-        result |= {f"{name}returns": returns, f"{name}mean": statistics.fmean(returns),
-                   f"{name}std": statistics.pstdev(returns)}
-        if policy:
-            frames = np.stack([row["image"] for row in rows]).repeat(4, 1).repeat(4, 2)
-            iio.imwrite(folder / "evaluation.mp4", frames, fps=25)            # 256 × 256
+        with contextlib.closing(config_envs(cfg, cfg.dst, pixels=bool(policy))) as envs:
+            keep = replay.add if policy else None
+            more = evaluate_agent(cfg, policy, envs, phase, keep)
+        result |= {name + key: value for key, value in more.items()}
+    frames = replay.window(0, replay.ends[0])["image"].repeat(4, 1).repeat(4, 2)
+    iio.imwrite(folder / "evaluation.mp4", frames, fps=25)                    # 256 × 256
     (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
-    print("{task}, {phase} colours, after {step:,} env steps: return {mean:.1f} ± {std:.1f}; "
-          "random policy: {random_mean:.1f} ± {random_std:.1f};".format(**result),
-          f"{len(returns)} episodes each\nwrote evaluation.json and evaluation.mp4 in {folder}")
+    said = ["{mean:.1f} ± {std:.1f}", "{random_mean:.1f} ± {random_std:.1f}"]
+    if "success" in result:
+        said = [said[0] + ", success {success:.0%}", said[1] + ", success {random_success:.0%}"]
+    print(("{task}, {phase} colours, after {step:,} env steps: return " + said[0]
+           + "; random policy: " + said[1] + ";").format(**result),
+          f"{cfg.eval_episodes} episodes each\nwrote evaluation.json, evaluation.mp4 and "
+          f"evaluation/*.npz in {folder}")
 
 # === Figures ======================================================================================
 
@@ -1536,10 +1733,10 @@ def bench(cfg):
     teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
     with contextlib.closing(config_env(cfg, cfg.dst, "train")) as env:
         agent = Agent(cfg, env.action_space.shape[0], device, teacher)
-        policy, image = agent_policy(agent, explore=True), env.render()
-        zeros = np.zeros(agent.action_dim, np.float32)
+        policy, image = agent_policy(agent, explore=True), env.render()[None]
+        zeros = np.zeros((1, agent.action_dim), np.float32)
         times = dict(frame=median_ms(env.render, 50),
-                     decision=median_ms(lambda: env.step(policy(image, zeros, None)[0]), 50))
+                     decision=median_ms(lambda: env.step(policy(image, zeros, None)[0][0]), 50))
     videos = dict(image=rng.integers(0, 256, (*shape, 64, 64, 3), np.uint8),
                   is_first=np.zeros(shape, bool))
     batch = videos | {key: np.ones(shape, np.float32) for key in ("reward", "discount")}
@@ -1617,8 +1814,8 @@ def parse_args(argv):
     cfg = replace(PRESETS[preset], **METHODS[given.get("method", "diswm")] | given)
     if not args.preset and args.command in ("collect", "pretrain", "finetune"):
         print(f"preset {preset}; --preset chooses another: {', '.join(PRESETS)}")
-    for task in {cfg.src, cfg.dst} - set(TASKS):
-        make_env(task)                                                        # lists what exists
+    for task in (cfg.src, cfg.dst):
+        check_task(task)
     return args, cfg
 
 def prepare_machine(cfg):
@@ -1669,4 +1866,5 @@ def main(argv=None):
     return 0
 
 if __name__ == "__main__":
+    from diswm import main  # so that the processes of --envs find everything by its name
     sys.exit(main())
