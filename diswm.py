@@ -41,6 +41,7 @@ import math
 import os
 import pickle
 import platform
+import re
 import resource
 import shutil
 import statistics
@@ -849,29 +850,25 @@ TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
 OTHER_TASKS = ("pusher", "drawer_open", "drawer_close")
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
-TABLE_TOPS = dict(train="grid", shifted="wood", eval="metal")  # DrawerWorld
-# Views from above: the published one; ours, with which the whole drawer of version 3 is visible.
-CAMERAS = dict(pusher=dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2)),
-               drawer=dict(distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0)))
 TRAINING, EVALUATION = 0, 1  # streams of episode_seed
 
 def family(task):
-    """Between two of "dmc", "pusher", "drawer" and "gymnasium", a transfer crosses domains."""
-    return ("dmc" if task in TASKS else
-            task.split("_")[0] if task in OTHER_TASKS else "gymnasium")
+    """"dmc", "pusher", "drawer" or "gymnasium": a transfer between two of them crosses domains."""
+    other = task.split("_")[0] if task in OTHER_TASKS else "gymnasium"
+    return "dmc" if task in TASKS else other
 
 def check_task(task):
     """Raise UserError with the nearest names unless there is such a task."""
-    if task not in TASKS and task not in OTHER_TASKS and task not in gym.registry:
+    known = [*TASKS, *OTHER_TASKS]
+    if task not in known and task not in gym.registry:
         with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
             import gymnasium_robotics  # noqa: F401  registers its tasks, and prints a notice
-    if task not in TASKS and task not in OTHER_TASKS and task not in gym.registry:
-        ours = [*TASKS, *OTHER_TASKS]
-        ids = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith(
-            ("gymnasium.envs.mujoco", "gymnasium_robotics"))]
-        near = " or ".join(difflib.get_close_matches(task, ours + ids)) or "none is similar"
-        raise UserError(f"unknown '{task}' ({near}); there are: {', '.join(ours)}, and Gymnasium's "
-                        "MuJoCo tasks, such as HalfCheetah-v5 or FetchReach-v4", code=2)
+    if task not in known and task not in gym.registry:
+        ids = [name for name, spec in gym.registry.items() if "mujoco." in str(spec.entry_point)
+               or "robotics" in str(spec.entry_point)]
+        near = " or ".join(difflib.get_close_matches(task, known + ids)) or "none is similar"
+        raise UserError(f"unknown '{task}' ({near}); there are: {', '.join(known)}, and the MuJoCo "
+                        "tasks of gymnasium and gymnasium-robotics, like FetchReach-v4", code=2)
 
 class DMControlEnv(gym.Env):
     """A task of dm_control.suite as a gymnasium.Env with a flat state observation."""
@@ -881,12 +878,8 @@ class DMControlEnv(gym.Env):
         spec, size = self.env.action_spec(), self.env.observation_spec()["observations"].shape
         self.action_space = gym.spaces.Box(np.float32(spec.minimum), np.float32(spec.maximum))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, size, np.float64)
-
-    def __getattr__(self, name):
         # The raw mujoco.MjModel and MjData, under the names that gymnasium's MuJoCo tasks use.
-        if name in ("model", "data"):
-            return getattr(self.env.physics, name).ptr
-        raise AttributeError(name)
+        self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -901,50 +894,54 @@ class DMControlEnv(gym.Env):
         return obs, float(step.reward), terminated, step.last() and not terminated, {}
 
 def drawer_world(task):
-    """DrawerWorld: a Meta-World task with three table tops; reset(options={"phase": …}) chooses.
-    Rewards and drawer are those of version 3, the only one left; version 1 is the original's."""
+    """DrawerWorld: Meta-World's task with three table tops; reset(options={"phase": …}) chooses."""
     import metaworld  # takes a second
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
-    folder = Path(metaworld.__file__).parent / "assets" / "textures"
-    checker = dict(builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, width=300, height=300,
-                   mark=mujoco.mjtMark.mjMARK_EDGE, rgb1=(0.1, 0.2, 0.3), rgb2=(0.2, 0.3, 0.4))
+    folder = f"{metaworld.__path__[0]}/assets/textures"
+    grid = dict(builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mark=mujoco.mjtMark.mjMARK_EDGE,
+                rgb1=(0.1, 0.2, 0.3), rgb2=(0.2, 0.3, 0.4), width=300, height=300)
+    tops = dict(train=grid, shifted=dict(file=f"{folder}/wood.png"),
+                eval=dict(file=f"{folder}/metal.png"))
 
     class DrawerWorld(ALL_V3_ENVIRONMENTS[task.replace("_", "-") + "-v3"]):
         def _initialize_simulation(self):
             spec = mujoco.MjSpec.from_file(self.fullpath)
-            for name in TABLE_TOPS.values():
-                source = checker if name == "grid" else dict(file=str(folder / f"{name}.png"))
-                spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, **source)
-                material = spec.add_material(name=name, texrepeat=(1, 1), texuniform=True)
-                material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+            for phase, source in tops.items():
+                spec.add_texture(name=phase, type=mujoco.mjtTexture.mjTEXTURE_2D, **source)
+                material = spec.add_material(name=phase, texrepeat=(1, 1), texuniform=True)
+                material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = phase
             model = spec.compile()
             model.mat_reflectance[:] = 0  # 17 ms a frame, for no visible difference
-            self.top = model.body("tablelink").geomadr[0]                     # a box on the legs
-            self.materials = {phase: model.mat(name).id for phase, name in TABLE_TOPS.items()}
-            self.materials["none"] = model.geom_matid[self.top]
             return model, mujoco.MjData(model)
 
         def reset(self, *, seed=None, options=None):
             if seed is not None:
                 self.seed(seed)                                               # reset ignores it
-            self.model.geom_matid[self.top] = self.materials[options["phase"]]
+            top = self.model.body("tablelink").geomadr[0]                     # a box on the legs
+            name = "table_wood" if options["phase"] == "none" else options["phase"]
+            self.model.geom_matid[top] = self.model.mat(name).id
             result = super().reset()
             mujoco.mj_forward(self.model, self.data)  # else one sees the drawer where it was before
             return result
     env = DrawerWorld()
     # Its own benchmark sets a goal from a list; this draws one at each reset, from the seed.
     env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
+    # DEVIATION: published from 0.96 above, where half of version 3's drawer is out of sight.
+    env.mujoco_renderer.default_cam_config = dict(
+        distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
     return env
 
 def bare_simulator(task):
-    """A task's simulator without wrappers → (env with `model` and `data`, steps per episode)."""
+    """A task's simulator without wrappers → (env, simulator steps per episode)."""
     if task in TASKS:
         return DMControlEnv(*TASKS[task]), 1000
-    if task in OTHER_TASKS and task != "pusher":
-        return drawer_world(task), 200                                        # DrawerWorld's own
-    name = "Pusher-v5" if task == "pusher" else task
-    env = gym.make(name, disable_env_checker=True, max_episode_steps=-1).unwrapped
-    return env, gym.spec(name).max_episode_steps
+    if family(task) == "drawer":
+        return drawer_world(task), 200
+    above = dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2))  # published
+    name, view = (task, {}) if task != "pusher" else (
+        "Pusher-v5", dict(default_camera_config=above))
+    env = gym.make(name, disable_env_checker=True, max_episode_steps=-1, **view)
+    return env.unwrapped, gym.spec(name).max_episode_steps
 
 class ActionRepeat(gym.Wrapper):
     """Hold an action for n simulator steps, sum the rewards; info["env_steps"] counts the steps.
@@ -1001,16 +998,14 @@ class ColorDistractor(gym.Wrapper):
         self.phase, self.colors = phase, colors
         self.half_range, self.step_std = half_range, step_std
         self.groups = color_groups(task, self.unwrapped.model)
-        self.original = self.look()
-        self.black = int(task == "pusher")  # how many groups are always black (published)
+        self.original = [array[rows, :3] for array, rows in self.groups]      # copies
+        # The first group of the Pusher, the object, is black (published).
+        self.tint = np.arange(len(self.groups))[:, None] >= (task == "pusher")
         self.rng = np.random.default_rng()
 
-    def look(self):
-        """The colours now: of each group, those of its rows."""
-        return [array[rows, :3] for array, rows in self.groups]
-
     def paint(self, colors):
-        """Give each group its colour or, from look(), its colours."""
+        """Give each group its colour, or its rows theirs."""
+        self.current = colors
         for (array, rows), color in zip(self.groups, colors, strict=True):
             array[rows, :3] = color
 
@@ -1019,38 +1014,37 @@ class ColorDistractor(gym.Wrapper):
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
         self.phase = (options or {}).get("phase", self.phase)
-        if self.phase == "none":
-            self.paint(self.original)
-        else:
-            first = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
-            self.box = color_box(self.phase, first, self.colors, self.half_range)
-            for bound in self.box:
-                bound[:self.black] = 0
-            self.paint(self.rng.uniform(*self.box))
+        original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
+        self.box = color_box(self.phase, original, self.colors, self.half_range)
+        colors = self.rng.uniform(*self.box) * self.tint
+        self.paint(self.original if self.phase == "none" else colors)
         return self.env.reset(seed=seed, options=(options or {}) | {"phase": self.phase})
 
     def step(self, action):
         """Optionally, the colours walk at random within the box."""
         if self.step_std and self.phase != "none":
-            rgb = np.array([rgb[0] for rgb in self.look()]).reshape(-1, 3)
-            self.paint(np.clip(rgb + self.rng.normal(0, self.step_std, rgb.shape), *self.box))
+            rgb = np.float32(self.current)                                    # as the model does
+            walk = rgb + self.rng.normal(0, self.step_std, rgb.shape)
+            self.paint(np.clip(walk, *self.box) * self.tint)
         return self.env.step(action)
 
 class Pixels(gym.ObservationWrapper):
     """Observe what a camera sees, uint8 (size, size, 3), through a renderer of one's own.
-    camera: of the model, or the properties of a free one.
     mujoco.Renderer makes its GL context current before each use; the simulators' render() does not,
     and then two of them in one process silently show each other's textures."""
     metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
 
-    def __init__(self, env, camera=0, size=64, fast=False):
+    def __init__(self, env, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
-        model, self.camera = self.unwrapped.model, camera
-        if isinstance(camera, dict):
+        task, model, self.camera = self.unwrapped, self.unwrapped.model, "track"
+        if isinstance(task, DMControlEnv):
+            self.camera = 0
+        elif mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track") < 0:  # gymnasium's rule
             self.camera = mujoco.MjvCamera()
             mujoco.mjv_defaultFreeCamera(model, self.camera)
-            for key, value in camera.items():
+            library = getattr(task, "mujoco_renderer", None)
+            for key, value in (getattr(library, "default_cam_config", None) or {}).items():
                 setattr(self.camera, key, value)
         quality = model.vis.quality
         quality.shadowsize = 512          # 20–60 % of a frame, for a mean difference < 0.2 / 255
@@ -1082,24 +1076,14 @@ class Pixels(gym.ObservationWrapper):
         self.renderer.close()
         super().close()
 
-def default_camera(task, env):
-    """Where a task is seen from: as published, or as its own library shows it."""
-    if task in TASKS:
-        return 0
-    track = mujoco.mj_name2id(env.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
-    renderer = getattr(env, "mujoco_renderer", None)
-    config = CAMERAS.get(family(task)) or getattr(renderer, "default_cam_config", None) or {}
-    return track if track >= 0 else config
-
 def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colors="published",
              color_range=0.2, color_step_std=0.0, fast_render=False, size=64, pixels=True):
     """The one env stack: simulator, actions in [−1, 1], time limit, action repeat, colours, pixels.
-    task: of dm_control, "pusher", "drawer_open", "drawer_close", or the id of a Gymnasium task with
-    a MuJoCo model and continuous actions. phase: "train", "shifted" (after the midpoint), "eval"
-    (those that a finished run is judged in; the shifted ones but for drawers) or "none" (the
+    task: of dm_control, pusher, drawer_open, drawer_close, or a Gymnasium id. phase: "train",
+    "shifted" (after the midpoint), "eval" (drawers: metal; else the shifted one) or "none" (the
     task's own look). time_limit: simulator steps, 0 for the task's own. pixels=False leaves the
     state observation, flat, and renders nothing. Returns a gymnasium.Env of uint8 (size, size, 3)
-    images. UserError: unknown task or phase, a task that does not fit, no OpenGL."""
+    images. UserError: unknown task or phase, one without MuJoCo or with discrete actions, no GL."""
     check_task(task)
     if phase not in PHASES:
         raise UserError(f"unknown phase '{phase}'; there are: {', '.join(PHASES)}", code=2)
@@ -1109,19 +1093,17 @@ def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colo
         reason = (str(error).splitlines() or [""])[0]
         raise UserError(f"{task} cannot be made ({reason}); run: pip install --force-reinstall -r "
                         "requirements.txt") from error
-    if not isinstance(getattr(env, "model", None), mujoco.MjModel):
-        raise UserError(f"{task} has no MuJoCo model to take pixels from; choose a MuJoCo task")
-    if not isinstance(env.action_space, gym.spaces.Box):
-        raise UserError(f"{task} has discrete actions; choose a task with continuous ones")
-    camera = default_camera(task, env)
+    if not isinstance(getattr(env, "model", None), mujoco.MjModel) or not isinstance(
+            env.action_space, gym.spaces.Box):
+        raise UserError(f"{task} has no MuJoCo model to render or no continuous actions; choose "
+                        "another, such as HalfCheetah-v5")
     env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
-    if time_limit or limit:
-        env = gym.wrappers.TimeLimit(env, time_limit or limit)
+    env = gym.wrappers.TimeLimit(env, time_limit or limit or 1000)
     env = ActionRepeat(env, action_repeat)
     env = ColorDistractor(env, task, phase, colors, color_range, color_step_std)
     if pixels:
         try:
-            env = Pixels(env, camera, size, fast_render)
+            env = Pixels(env, size, fast_render)
         except (AttributeError, ImportError, RuntimeError) as error:
             raise UserError(f"MuJoCo with MUJOCO_GL={os.environ['MUJOCO_GL']} cannot render "
                             f"({error}); {GL_HINT}") from error
@@ -1152,11 +1134,10 @@ def episode_seed(seed, stream, index):
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
 
 def play_episodes(envs, policy, seeds, phase, each=None):
-    """Play an episode in each environment → [(rows (see make_row), whether it succeeded), …].
+    """Play an episode in each environment → their [(rows (see make_row), return, success), …].
     policy(images, actions, state) → (actions, state), given the previous actions and, at first,
-    None. each(env steps) is called after each decision, with those of the environments that were
-    still playing, an array; all episodes are cut where it returns true. Success is None where the
-    task does not tell."""
+    None. each(env_steps), an entry for each environment still playing, is called after each
+    decision; all are cut where it returns true. Success is None where the task does not tell."""
     images, _ = envs.reset(seed=seeds, options=dict(phase=phase))
     actions, state = np.zeros(envs.action_space.shape, np.float32), None
     episodes = [[make_row(*pair, first=True)] for pair in zip(images, actions, strict=True)]
@@ -1171,7 +1152,8 @@ def play_episodes(envs, policy, seeds, phase, each=None):
                 success[i] = bool(success[i] or info["success"][i])
         cut = bool(each and each(info["env_steps"][playing]))
         playing &= ~(terminated | truncated | cut)
-    return list(zip(episodes, success, strict=True))
+    return [(rows, math.fsum(row["reward"] for row in rows), reached)
+            for rows, reached in zip(episodes, success, strict=True)]
 
 def random_policy(seeds):
     """Uniform actions in [−1, 1], from a stream for each environment."""
@@ -1184,12 +1166,6 @@ def agent_policy(agent, explore):
     return functools.partial(agent.act, explore=explore)
 
 # === Runs: folders, checkpoints, logs, and the training loop ======================================
-
-def eta_delay(cfg):
-    """Decisions before distillation begins: as set, or by the two tasks' families."""
-    if cfg.eta_delay >= 0:
-        return cfg.eta_delay
-    return 0 if family(cfg.src) == family(cfg.dst) else cfg.eta_decay
 
 def run_folder(cfg, stage):
     """runs/<stage>/<tasks>/<method>/seed<k>, so that the same command finds its run again."""
@@ -1214,7 +1190,9 @@ class Run:
     """A run's folder: checkpoint.pt, config.json, metrics.jsonl, TensorBoard events."""
 
     def __init__(self, cfg, stage, fresh=False):
-        cfg = replace(cfg, eta_delay=eta_delay(cfg))
+        if cfg.eta_delay < 0:
+            delay = cfg.eta_decay if family(cfg.src) != family(cfg.dst) else 0
+            cfg = replace(cfg, eta_delay=delay)
         self.cfg, self.stage, self.folder = cfg, stage, run_folder(cfg, stage)
         self.checkpoint = self.folder / "checkpoint.pt"
         self.log_path = self.folder / "metrics.jsonl"
@@ -1370,7 +1348,7 @@ class AgentTrainer(Trainer):
         """Do the updates that are due after so many decisions → a list of their metrics."""
         cfg, metrics = self.cfg, []
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
-        eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, eta_delay(cfg))
+        eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
         for _ in range(self.updates_due(decisions)):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
@@ -1398,18 +1376,20 @@ class AgentTrainer(Trainer):
         """An episode in each environment, and an evaluation when one is due → a row of the log."""
         cfg, phase, before = self.cfg, self.phase, self.progress
         episodes, metrics = self.play()
-        for rows, _ in episodes:
-            self.replay.add(rows)
         self.episodes += len(episodes)
-        result = summary(episodes)
-        row = dict(step=self.progress, phase=phase, train_return=result.pop("mean"),
-                   train_length=statistics.mean(len(rows) - 1 for rows, _ in episodes))
+        rows, returns, success = zip(*episodes, strict=True)
+        for episode in rows:
+            self.replay.add(episode)
+        row = dict(step=self.progress, phase=phase, train_return=statistics.fmean(returns),
+                   train_length=statistics.mean(len(episode) - 1 for episode in rows))
         row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
-        row |= {f"train_{key}": value for key, value in result.items() if key == "success"}
+        if None not in success:
+            row["train_success"] = statistics.fmean(success)
         due = self.progress // cfg.eval_every > before // cfg.eval_every
         if due or self.progress >= self.total:
-            result = evaluate_agent(cfg, self.agent, self.envs, phase)
-            row |= dict(eval_return=result.pop("mean"))
+            apart = family(cfg.dst) == "drawer"  # its third table top is never trained on
+            result = evaluate_agent(cfg, self.agent, self.envs, "eval" if apart else phase)
+            row["eval_return"] = result.pop("mean")
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
 
@@ -1424,33 +1404,24 @@ class AgentTrainer(Trainer):
             teacher = dict(depth=teacher.net[0].out_channels, weights=teacher.state_dict())
         return super().state_dict() | dict(teacher=teacher, action_dim=self.agent.action_dim)
 
-def summary(episodes):
-    """Mean, list and standard deviation of their returns; share that succeeded, if known."""
-    returns = [math.fsum(row["reward"] for row in rows) for rows, _ in episodes]
-    result = dict(mean=statistics.fmean(returns), returns=returns, std=statistics.pstdev(returns))
-    known = [success for _, success in episodes if success is not None]
-    return result | (dict(success=statistics.fmean(known)) if known else {})
-
-def evaluation_phase(task, phase):
-    """Drawers are judged on the table top that training never shows, other tasks in `phase`."""
-    return "eval" if family(task) == "drawer" else phase
-
-def evaluate_agent(cfg, agent, envs, phase, keep=None):
+def evaluate_agent(cfg, agent, envs, phase, replay=None):
     """Play `eval_episodes` episodes, the same seeds every time; agent None: random actions.
-    Returns their summary(). Training's random numbers stay untouched."""
-    phase = evaluation_phase(cfg.dst, phase)
-    episodes, count = [], envs.num_envs
+    Adds them to the replay. Returns mean, list and standard deviation of their returns, and the
+    share that succeeded where the task tells. Training's random numbers stay untouched."""
+    returns, successes, count = [], [], envs.num_envs
     with torch.random.fork_rng():
         torch.manual_seed(cfg.seed)
         for first in range(0, cfg.eval_episodes, count):
             seeds = [episode_seed(cfg.seed, EVALUATION, first + i) for i in range(count)]
             policy = agent_policy(agent, explore=False) if agent else random_policy(seeds)
-            played = play_episodes(envs, policy, seeds, phase)[:cfg.eval_episodes - first]
-            for rows, success in played:
-                if keep:
-                    keep(rows)
-                episodes.append(([dict(reward=row["reward"]) for row in rows], success))
-    return summary(episodes)
+            episodes = play_episodes(envs, policy, seeds, phase)
+            for rows, total, success in episodes[:cfg.eval_episodes - first]:
+                returns.append(total)
+                successes.append(success)
+                if replay:
+                    replay.add(rows)
+    result = dict(mean=statistics.fmean(returns), returns=returns, std=statistics.pstdev(returns))
+    return result if None in successes else result | dict(success=statistics.fmean(successes))
 
 # === Stages =======================================================================================
 
@@ -1470,7 +1441,7 @@ def train_agent(cfg, stage, fresh):
         teacher = saved_teacher(saved, cfg, device) if saved else find_teacher(cfg, device)
     announce(cfg, stage, run.folder, cfg.steps // cfg.action_repeat)
     torch.manual_seed(cfg.seed)
-    trainer = AgentTrainer(cfg, run.folder, device, teacher)
+    trainer = AgentTrainer(run.cfg, run.folder, device, teacher)
     with contextlib.closing(trainer.envs):
         train(trainer, run)
     return run.folder
@@ -1554,33 +1525,31 @@ def load_model(folder, device):
 
 def evaluate(folder, device, episodes=None):
     """Stage 4: episodes with the actor's mode, and as many with random actions.
-    Writes evaluation.json, and the first episode as evaluation.mp4, into the run's folder."""
+    Writes evaluation.json, its episodes, and the first of them as evaluation.mp4."""
     folder = Path(folder)
     cfg, agent, trainer = load_model(folder, device)
     if not isinstance(agent, Agent):
         raise UserError(f"{folder} is a video predictor without a policy; give a finetune run")
     cfg = replace(cfg, eval_episodes=episodes or cfg.eval_episodes)
     switched = trainer["progress"] >= int(cfg.switch * cfg.steps) < cfg.steps
-    phase = evaluation_phase(cfg.dst, "shifted" if switched else "train")
+    phase = "shifted" if switched else "train"
+    phase = "eval" if family(cfg.dst) == "drawer" else phase                  # as while it trained
     result = dict(task=cfg.dst, phase=phase, step=trainer["progress"])
     shutil.rmtree(folder / "evaluation", ignore_errors=True)
-    replay = Replay(folder / "evaluation")
+    replay, said = Replay(folder / "evaluation"), []
     for name, policy in (("", agent), ("random_", None)):
         # Nobody looks at what the random policy sees.
         with contextlib.closing(config_envs(cfg, cfg.dst, pixels=bool(policy))) as envs:
-            keep = replay.add if policy else None
-            more = evaluate_agent(cfg, policy, envs, phase, keep)
+            more = evaluate_agent(cfg, policy, envs, phase, replay if policy else None)
         result |= {name + key: value for key, value in more.items()}
+        success = f", success {more['success']:.0%}" if "success" in more else ""
+        said.append(f"{more['mean']:.1f} ± {more['std']:.1f}{success}")
     frames = replay.window(0, replay.ends[0])["image"].repeat(4, 1).repeat(4, 2)
     iio.imwrite(folder / "evaluation.mp4", frames, fps=25)                    # 256 × 256
     (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
-    said = ["{mean:.1f} ± {std:.1f}", "{random_mean:.1f} ± {random_std:.1f}"]
-    if "success" in result:
-        said = [said[0] + ", success {success:.0%}", said[1] + ", success {random_success:.0%}"]
-    print(("{task}, {phase} colours, after {step:,} env steps: return " + said[0]
-           + "; random policy: " + said[1] + ";").format(**result),
-          f"{cfg.eval_episodes} episodes each\nwrote evaluation.json, evaluation.mp4 and "
-          f"evaluation/*.npz in {folder}")
+    print(f"{cfg.dst}, {phase} colours, after {result['step']:,} env steps: return {said[0]}; "
+          f"random policy: {said[1]}; {cfg.eval_episodes} episodes each\n"
+          f"wrote evaluation.json, evaluation.mp4 and evaluation/*.npz in {folder}")
 
 # === Figures ======================================================================================
 
@@ -1693,8 +1662,8 @@ def plot(folders, path):
             axes.fill_between(steps, mean - spread, mean + spread, alpha=0.2, color=color)
         if tasks in switches:
             axes.axvline(switches[tasks], color="gray", ls=":", label="the colours change")
-        axes.set(title=tasks.replace("-", " → "), xlabel="env steps", ylabel="evaluation return",
-                 ylim=(0, None))
+        axes.set(title=re.sub(r"-(?!v\d)", " → ", tasks), ylim=(0, None),      # Hopper-v5
+                 xlabel="env steps", ylabel="evaluation return")
         axes.legend()
         axes.grid(alpha=0.3)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -1704,16 +1673,27 @@ def plot(folders, path):
 # === Doctor and bench =============================================================================
 
 def doctor(cfg):
-    """Print versions and device; render a frame of each env family in each phase to doctor.png."""
+    """Print versions and device; render a frame of each family of tasks in each phase, doctor.png.
+    Raises UserError, once all have been tried, where one does not render."""
     print(f"python {platform.python_version()}  torch {torch.__version__}  mujoco "
           f"{mujoco.__version__}  gymnasium {gym.__version__}\n{cfg.device}, {cfg.precision}, "
           f"{torch.get_num_threads()} threads, MUJOCO_GL={os.environ['MUJOCO_GL']}")
-    pictures = []
-    for phase in PHASES:
-        with contextlib.closing(config_env(cfg, cfg.dst, phase)) as env:
-            pictures.append(env.reset(seed=cfg.seed)[0])
+    tasks = [cfg.dst if cfg.dst in TASKS else "walker_walk", "pusher", "drawer_open",
+             "FetchReach-v4", "HalfCheetah-v5"]
+    rows, failed = [], []
+    for task in tasks:
+        try:
+            with contextlib.closing(config_env(cfg, task, "none")) as env:
+                rows.append([env.reset(seed=cfg.seed, options=dict(phase=phase))[0]
+                             for phase in PHASES])
+        except UserError as error:
+            print(f"{task}: {error}")
+            failed.append(task)
+            rows.append([np.full((64, 64, 3), 128, np.uint8)] * len(PHASES))
     Path(cfg.runs).mkdir(parents=True, exist_ok=True)
-    draw_grid(np.array([pictures]), [cfg.dst], PHASES, Path(cfg.runs) / "doctor.png")
+    draw_grid(np.array(rows), tasks, PHASES, Path(cfg.runs) / "doctor.png")
+    if failed:
+        raise UserError(f"{', '.join(failed)} cannot be rendered; the causes stand above")
 
 def median_ms(function, repeats=5):
     """Median wall time of a call, after one to warm up."""

@@ -461,6 +461,7 @@ def test_eta_has_the_papers_values(step, eta):
 class FakeEnv(gym.Env):
     """Noise for ten decisions of two env steps each; counts its decisions."""
 
+
     action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     observation_space = gym.spaces.Box(0, 255, (64, 64, 3), np.uint8)
     count = 0
@@ -1127,7 +1128,7 @@ def test_replay_rows_align_image_with_the_action_and_reward_that_led_to_it(
     with tempfile.TemporaryDirectory() as folder:
         trainer = counting_trainer(cfg, folder, length, terminates)
         for _ in range(2):
-            trainer.replay.add(trainer.play()[0])
+            trainer.replay.add(trainer.play()[0][0][0])
         rows = trainer.replay.window(0, trainer.replay.rows)
     assert trainer.updates > 0  # the agent, not only prefill, has acted
     per_episode = -(-length // repeat) + 1
@@ -1148,10 +1149,11 @@ def test_replay_rows_align_image_with_the_action_and_reward_that_led_to_it(
 
 
 def test_evaluation_episodes_align_like_training_episodes():
-    """play_episode's rows make the evaluation video; their rewards sum to the return."""
-    env = diswm.ActionRepeat(CountingEnv(9, False), 2)
-    episode = diswm.play_episode(env, diswm.random_policy(env, 0), 0, "train")
-    total, rows = sum(row["reward"] for row in episode), rows_to_arrays(episode)
+    """Their rows make the evaluation video; their rewards sum to the return."""
+    envs = gym.vector.SyncVectorEnv([lambda: diswm.ActionRepeat(CountingEnv(9, False), 2)])
+    (episode, total, success), = diswm.play_episodes(envs, diswm.random_policy([0]), [0], "train")
+    rows = rows_to_arrays(episode)
+    assert success is None
     assert rows["image"][:, 0, 0, 0].tolist() == [0, 2, 4, 6, 8, 9]
     codes = np.round((rows["action"][1:, 0].astype(float) + 1) * 100)
     assert np.array_equal(rows["image"][1:, 0, 0, 1], codes)
@@ -1367,16 +1369,17 @@ def play_on(trainer, episodes=99):
     seen = []
     while trainer.progress < trainer.total and len(seen) < episodes:
         start = trainer.progress
-        trainer.replay.add(trainer.play()[0])
+        trainer.replay.add(trainer.play()[0][0][0])
         trainer.episodes += 1
-        seen.append((start, trainer.env.get_wrapper_attr("phase"), materials(trainer.env).mean(0)))
+        env, = trainer.envs.envs
+        seen.append((start, env.get_wrapper_attr("phase"), materials(env).mean(0)))
     return seen
 
 
 def test_colors_switch_exactly_once_at_the_midpoint_of_a_live_run(tmp_path):
     """Section 2, row 9: it fires at half of the env steps and ends the running episode."""
     trainer = switching_trainer(tmp_path)
-    with contextlib.closing(trainer.env), contextlib.closing(trainer.eval_env):
+    with contextlib.closing(trainer.envs):
         seen = play_on(trainer)
     assert [(start, phase) for start, phase, _ in seen] == [
         (0, "train"), (20, "train"), (40, "train"),
@@ -1391,7 +1394,7 @@ def test_color_switch_survives_a_resume(tmp_path, cut):
     trainers = [switching_trainer(tmp_path) for _ in range(2)]
     with contextlib.ExitStack() as stack:
         for trainer in trainers:
-            stack.callback(trainer.env.close), stack.callback(trainer.eval_env.close)
+            stack.callback(trainer.envs.close)
         seen = play_on(trainers[0], cut)
         trainers[1].replay = Replay(tmp_path / "episodes")
         trainers[1].load_state_dict(trainers[0].state_dict())
@@ -1402,7 +1405,7 @@ def test_color_switch_survives_a_resume(tmp_path, cut):
 def test_switch_at_one_never_changes_the_colors(tmp_path):
     """Collect uses the `train` colours throughout."""
     trainer = switching_trainer(tmp_path, switch=1.0)
-    with contextlib.closing(trainer.env), contextlib.closing(trainer.eval_env):
+    with contextlib.closing(trainer.envs):
         assert {phase for _, phase, _ in play_on(trainer)} == {"train"}
 
 
@@ -1508,7 +1511,7 @@ def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
 def play_on_counting(trainer):
     """Play a CountingEnv trainer to its end."""
     while trainer.progress < trainer.total:
-        trainer.replay.add(trainer.play()[0])
+        trainer.replay.add(trainer.play()[0][0][0])
         trainer.episodes += 1
 
 
