@@ -1062,9 +1062,12 @@ class Pixels(gym.ObservationWrapper):
         return self.observation(None), info
 
     def observation(self, observation):
-        if hasattr(self.unwrapped, "_render_callback"):
-            self.unwrapped._render_callback()                                 # puts Fetch's goal
-        self.renderer.update_scene(self.unwrapped.data, camera=self.camera)
+        data = self.unwrapped.data
+        if hasattr(self.unwrapped, "_render_callback"):                       # puts Fetch's goal
+            warmstart = data.qacc_warmstart.copy()
+            self.unwrapped._render_callback()
+            data.qacc_warmstart[:] = warmstart  # else looking would change, in bits, what happens
+        self.renderer.update_scene(data, camera=self.camera)
         return self.renderer.render()
 
     def render(self):

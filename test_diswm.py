@@ -1195,7 +1195,11 @@ def test_every_task_of_the_paper_gives_64_by_64_pixels_and_bounded_actions(task)
     assert (rewards >= 0).all() and (rewards <= 2).all()  # DMC: 0..1 per env step, repeat 2
 
 
-@pytest.mark.parametrize("task", ["walker_walk", "cartpole_swingup"])
+FAMILIES = ("walker_walk", "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5")
+
+
+@pytest.mark.parametrize(
+    "task", [*FAMILIES, "cartpole_swingup", "drawer_close"])
 @pytest.mark.filterwarnings("ignore:.*The environment .* is different from the unwrapped version.*")
 def test_env_passes_gymnasiums_checker(task):
     """The stack is a gymnasium.Env: spaces, dtypes, seeding, return values."""
@@ -1203,15 +1207,91 @@ def test_env_passes_gymnasiums_checker(task):
         check_env(env, skip_render_check=True, skip_close_check=True)
 
 
-@settings(max_examples=4)
-@given(seed=st.integers(0, 2**31), phase=st.sampled_from(["train", "shifted"]))
-def test_same_seed_gives_the_same_pixels_and_another_seed_others(seed, phase):
-    """The published code leaves its colours unseeded."""
-    with closing_env("walker_walk", phase=phase) as one, closing_env("walker_walk", seed=3) as two:
-        first, again = roll(one, seed), roll(two, seed, phase=phase)
-        other = roll(two, seed + 1)
+@pytest.mark.parametrize("task", [*FAMILIES, "quadruped_escape"])
+def test_same_seed_gives_the_same_pixels_and_another_seed_others(task):
+    """Whatever was played before. The published code leaves its colours unseeded; Meta-World
+    ignores reset(seed); quadruped_escape has a new terrain, which only its own renderer shows."""
+    with closing_env(task, phase="shifted") as one, closing_env(task, seed=3) as two:
+        other = roll(two, 6, phase="eval")
+        first, again = roll(one, 5), roll(two, 5, phase="shifted")
     assert np.array_equal(first[0], again[0]) and np.array_equal(first[1], again[1])
     assert not np.array_equal(first[0][0], other[0][0])
+
+
+def looks(env):
+    """All colours and materials that the simulator shows."""
+    model = env.unwrapped.model
+    return np.concatenate([model.mat_rgba.ravel(), model.geom_rgba.ravel(), model.geom_matid])
+
+
+@pytest.mark.parametrize("task", FAMILIES)
+def test_each_phase_looks_different_and_none_is_the_task_as_it_is(task):
+    """Returning to `none` restores everything; `eval` differs where a task keeps it apart."""
+    with closing_env(task, phase="none") as env:
+        original, pictures = looks(env), {}
+        for phase in (*diswm.PHASES[:3], "none"):
+            pictures[phase] = env.reset(seed=3, options=dict(phase=phase))[0].astype(int)
+            assert np.array_equal(looks(env), original) == (phase == "none")
+    for one, two in (("train", "shifted"), ("train", "none"), ("shifted", "none")):
+        assert np.abs(pictures[one] - pictures[two]).mean() > 2
+    apart = np.abs(pictures["shifted"] - pictures["eval"]).mean()
+    assert apart > 2 if task == "drawer_open" else apart == 0
+
+
+def test_drawer_world_wears_grid_wood_and_metal_on_its_table_only():
+    """Judged by colour: the grid is blue, the wood brown, the metal grey; the rest stays."""
+    with closing_env("drawer_open") as env:
+        views = [env.reset(seed=1, options=dict(phase=phase))[0].astype(int)
+                 for phase in ("train", "shifted", "eval")]
+    grid, wood, metal = (view[50:, 12:50].mean((0, 1)) for view in views)
+    assert grid[2] > 1.3 * grid[0] and wood[0] > 1.3 * wood[2] and np.ptp(metal) < 0.1 * metal.max()
+    arm = [view[30:36, :12] for view in views]
+    assert max(np.abs(one - two).mean() for one in arm for two in arm) < 10
+
+
+@pytest.mark.parametrize("task", ["drawer_open", "drawer_close", "FetchReach-v4"])
+def test_first_picture_shows_what_the_reset_has_placed(task):
+    """Meta-World moves the drawer without telling MuJoCo, and Fetch its goal: both were drawn
+    where they had been before."""
+    import mujoco
+    with closing_env(task, phase="none") as env:
+        for seed in range(3):
+            picture = env.reset(seed=seed)[0].copy()
+            mujoco.mj_forward(env.unwrapped.model, env.unwrapped.data)
+            assert np.array_equal(picture, env.render())
+        if task == "FetchReach-v4":
+            goal = env.unwrapped.model.site("target0").id
+            assert np.allclose(env.unwrapped.data.site_xpos[goal], env.unwrapped.goal)
+
+
+def test_pusher_has_a_black_object_one_table_colour_and_one_arm_colour():
+    """The published distractor."""
+    arm = ("uar", "ua", "ef", "sp", "fa", "sl", "e1", "e2")
+    with closing_env("pusher", pixels=False, color_step_std=0.2) as env:
+        for seed in range(5):
+            env.reset(seed=seed)
+            env.step(env.action_space.sample())
+            model = env.unwrapped.model
+            colors = {tuple(model.geom(name).rgba[:3]) for name in arm}
+            assert len(colors) == 1 and tuple(model.geom("table").rgba[:3]) not in colors
+            assert not model.geom_rgba[model.body("object").geomadr[0], :3].any()
+            assert (np.abs(np.array(*colors) - (0.7, 0.3, 0.5)) <= 0.2 + 1e-6).all()
+
+
+@pytest.mark.parametrize("task", ["HalfCheetah-v5", "FetchReach-v4", "Hopper-v5"])
+def test_distractor_of_any_mujoco_task_changes_the_colors_that_mujoco_uses(task):
+    """geom_rgba hides the material's colour unless it is (.5, .5, .5, 1)."""
+    with closing_env(task, phase="none") as env:
+        model, picture = env.unwrapped.model, env.reset(seed=0)[0].astype(int)
+        for geom in range(model.ngeom):
+            used = model.geom_matid[geom] >= 0 and (model.geom_rgba[geom] == (.5, .5, .5, 1)).all()
+            before = model.mat_rgba[model.geom_matid[geom]] if used else model.geom_rgba[geom]
+            before = before.copy()
+            env.reset(seed=0, options=dict(phase="train"))
+            after = model.mat_rgba[model.geom_matid[geom]] if used else model.geom_rgba[geom]
+            assert (before[:3] != after[:3]).any() and before[3] == after[3]
+            env.reset(seed=0, options=dict(phase="none"))
+        assert np.array_equal(env.reset(seed=0)[0], picture)
 
 
 def test_zero_color_range_around_the_originals_changes_no_pixel():
@@ -1225,7 +1305,7 @@ def test_zero_color_range_around_the_originals_changes_no_pixel():
         assert not np.array_equal(roll(distracted, 5)[0], expected)
 
 
-@pytest.mark.parametrize("task", ["walker_walk", "cartpole_swingup", "reacher_easy"])
+@pytest.mark.parametrize("task", [*FAMILIES, "cartpole_swingup", "reacher_easy"])
 def test_distractor_leaves_state_and_reward_bit_identical(task):
     """The distractor changes what is seen, not what happens: its random stream is its own."""
     with (closing_env(task, phase="none", pixels=False) as plain,
@@ -1339,22 +1419,126 @@ def test_time_limit_counts_env_steps_and_is_no_terminal(limit):
     assert steps == limit and truncated and not terminated
 
 
-def test_envs_alive_at_once_do_not_mix_textures():
+def test_ten_envs_alive_at_once_do_not_mix_textures():
     """gymnasium's renderer forgets to switch GL contexts: one env gets the other's textures."""
-    kinds = (("walker_walk", "train"), ("cartpole_swingup", "none"), ("walker_walk", "shifted"))
+    kinds = [*((task, "train") for task in FAMILIES), ("drawer_open", "eval"), ("pusher", "none"),
+             ("walker_walk", "shifted"), ("cartpole_swingup", "none"), ("drawer_close", "shifted")]
     alone = []
     for task, phase in kinds:
         with closing_env(task, phase=phase) as env:
-            alone.append(roll(env, 2, steps=6)[0])
+            alone.append(roll(env, 2, steps=2)[0])
     with contextlib.ExitStack() as stack:
         envs = [stack.enter_context(closing_env(task, phase=phase)) for task, phase in kinds]
         rngs, count = [np.random.default_rng(2) for _ in kinds], [0] * len(kinds)
         for env, frames in zip(envs, alone, strict=True):
             assert np.array_equal(env.reset(seed=2)[0], frames[0])
-        for i in np.random.default_rng(0).permutation([0, 1, 2] * 6):
+        for i in np.random.default_rng(0).permutation([*range(len(kinds))] * 2):
             action = rngs[i].uniform(-1, 1, envs[i].action_space.shape).astype(np.float32)
             count[i] += 1
             assert np.array_equal(envs[i].step(action)[0], alone[i][count[i]]), kinds[i]
+
+
+class Reaching(CountingEnv):
+    """Succeeds at its third step only, and says so as Meta-World or as Fetch does."""
+
+    def __init__(self, key, length):
+        super().__init__(length, terminates=False)
+        self.key = key
+
+    def step(self, action):
+        *result, info = super().step(action)
+        return *result, info | {self.key: float(self.count == 3)}
+
+
+@pytest.mark.parametrize("key", ["success", "is_success"])
+def test_success_reached_at_any_simulator_step_counts_for_the_episode(key):
+    """Step 3 is the first of its decision's two; looking at the last step alone misses it."""
+    for length, expected in ((10, True), (2, False)):
+        envs = gym.vector.SyncVectorEnv([lambda n=length: diswm.ActionRepeat(Reaching(key, n), 2)])
+        (_, _, success), = diswm.play_episodes(envs, diswm.random_policy([0]), [0], "train")
+        assert success is expected
+
+
+def vector_config(envs, **changes):
+    """Random actions in the Pusher, by as many environments side by side."""
+    return tiny_config("dreamerv2", dst="pusher", envs=envs, prefill=10**6, time_limit=12,
+                       steps=10**6, **changes)
+
+
+def test_parallel_envs_fill_the_replay_like_as_many_single_ones(tmp_path):
+    """--envs 2 against --envs 1, bit for bit; two are processes of their own."""
+    for envs in (1, 2):
+        trainer = AgentTrainer(vector_config(envs), tmp_path / str(envs), CPU)
+        with contextlib.closing(trainer.envs):
+            for _ in range(4 // envs):
+                for rows, *_ in trainer.play()[0]:
+                    trainer.replay.add(rows)
+                    trainer.episodes += 1
+        assert (trainer.progress, trainer.decisions) == (48, 24)
+    one, two = (sorted((tmp_path / name / "episodes").glob("*")) for name in "12")
+    assert len(one) == 4 and [p.read_bytes() for p in one] == [p.read_bytes() for p in two]
+
+
+class Ending(CountingEnv):
+    """An episode's length depends on its seed: 4, 5, 6 or 7 steps."""
+
+    def reset(self, *, seed=None, options=None):
+        self.length = self.length if seed is None else 4 + seed % 4
+        return super().reset(seed=seed, options=options)
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 99), every=st.integers(1, 5), count=st.integers(1, 4))
+def test_parallel_episodes_end_one_by_one_and_updates_count_decisions(seed, every, count):
+    """Rows of a finished environment are ignored; an update follows each train_every decisions,
+    however many fall into one step of all environments."""
+    seeds = [seed * count + i for i in range(count)]
+    envs = gym.vector.SyncVectorEnv([lambda: diswm.ActionRepeat(Ending(4, True), 1)] * count)
+    cfg, updates = tiny_config("dreamerv2", train_every=every, prefill=0, steps=10**6), []
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        patch.setattr(diswm, "config_envs", lambda *args, **kwargs: envs)
+        patch.setattr(diswm, "episode_seed", lambda run, stream, index: seeds[index])
+        trainer = AgentTrainer(cfg, Path(folder), CPU)
+        trainer.replay.add(numbered_rows(0, 20))
+        trainer.updates = 1
+        trainer.agent.update = lambda *args: updates.append(trainer.decisions) or {}
+        episodes, _ = trainer.play()
+    lengths = [4 + s % 4 for s in seeds]
+    assert [len(rows) - 1 for rows, *_ in episodes] == lengths
+    assert [rows[-1]["is_terminal"] for rows, *_ in episodes] == [True] * count
+    assert trainer.decisions == trainer.progress == sum(lengths)
+    assert len(updates) == sum(lengths) // every
+    for rows, total, _ in episodes:
+        assert [row["image"][0, 0, 0] for row in rows] == [*range(len(rows))]
+        assert total == pytest.approx(sum(row["reward"] for row in rows))
+
+
+def test_registered_ids_work_in_other_processes(tmp_path, task="drawer_open"):
+    """gymnasium.make after `import diswm`, and AsyncVectorEnv under spawn; no GL error at exit,
+    not even of an environment that is left open."""
+    script = tmp_path / "user.py"
+    script.write_text(f"""
+import gymnasium
+import numpy as np
+import diswm
+
+def make():
+    import diswm
+    return gymnasium.make("DisWM/{task}-v0", phase="shifted", size=32, action_repeat=3)
+
+if __name__ == "__main__":
+    env = make()
+    expected, _ = env.reset(seed=5)
+    assert expected.shape == (32, 32, 3) and env.spec.id == "DisWM/{task}-v0"
+    assert env.step(env.action_space.sample())[-1]["env_steps"] == 3
+    envs = gymnasium.vector.AsyncVectorEnv([make] * 2, context="spawn")
+    assert np.array_equal(envs.reset(seed=[5, 6])[0][0], expected)
+    envs.close()
+""")
+    done = subprocess.run([sys.executable, "-W", "ignore", script], capture_output=True, text=True,
+                          env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [
+                              str(Path(diswm.__file__).parent), os.environ.get("PYTHONPATH")]))})
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def switching_trainer(folder, **changes):
@@ -1598,6 +1782,87 @@ def test_methods_without_a_teacher_need_no_pretraining(method, tmp_path):
     assert "distill" not in values and ("disentangle" in values) == (method != "dreamerv2")
 
 
+def recompute(folder):
+    """Returns of the episodes in <run>/evaluation, from the files alone."""
+    returns = []
+    for path in sorted((folder / "evaluation").glob("*.npz")):
+        with np.load(path) as episode:
+            assert episode["is_first"].tolist() == [True] + [False] * (len(episode["image"]) - 1)
+            returns.append(episode["reward"].astype(float).sum())
+    return returns
+
+
+@pytest.mark.parametrize("task", ["pusher", "drawer_open"])
+def test_cross_domain_pipeline_waits_with_distillation_and_evaluates(task, teacher, tmp_path):
+    """The published delay is eta_decay decisions (60 of the debug preset's 150); drawers are judged
+    on metal, which training never shows; the returns can be recomputed from the saved episodes."""
+    succeed("finetune", "--dst", task, "--teacher", teacher, "--runs", tmp_path, *DEBUG)
+    run = tmp_path / f"finetune/cheetah_run-{task}/diswm/seed0"
+    rows = read_rows(run)
+    assert json.loads((run / "config.json").read_text())["eta_delay"] == 60
+    etas = {row["decisions"]: row["eta"] for row in rows if "eta" in row}
+    assert etas[50] == 0 and all(eta > 0 for decisions, eta in etas.items() if decisions > 75)
+    drawer = task == "drawer_open"
+    assert all(("train_success" in row) == drawer for row in rows)
+    assert ("eval_success" in rows[-1]) == drawer
+    for _ in range(2):  # the second time replaces what the first one wrote
+        out = succeed("evaluate", "--run", run)
+    result = json.loads((run / "evaluation.json").read_text())
+    assert result["phase"] == ("eval" if drawer else "shifted")
+    assert ("success" in result) == ("random_success" in result) == ("success" in out) == drawer
+    assert recompute(run) == pytest.approx(result["returns"], rel=1e-6)
+    assert f"return {np.mean(recompute(run)):.1f} ± {np.std(recompute(run)):.1f}" in out
+
+
+@pytest.mark.parametrize("task, actions", [
+    ("Hopper-v5", 3), ("FetchReach-v4", 4), ("cartpole_swingup", 1), ("humanoid_walk", 21)])
+def test_tasks_with_early_ends_dict_observations_and_1_to_21_actions_train(task, actions, tmp_path):
+    """Hopper falls: its last row is terminal and has discount 0. Fetch only counts its steps."""
+    succeed("finetune", "--dst", task, "--method", "dreamerv2", "--runs", tmp_path, *DEBUG,
+            "--steps", 160, "--eval-every", 1000)
+    run, = tmp_path.rglob("seed0")
+    assert run.parent.parent.name == f"cheetah_run-{task}"
+    assert read_rows(run)[-1]["updates"] > 0
+    ends = []
+    for path in (run / "episodes").glob("*.npz"):
+        with np.load(path) as episode:
+            assert episode["action"].shape[1] == actions
+            assert (episode["discount"] == 1 - episode["is_terminal"]).all()
+            assert not episode["is_terminal"][:-1].any()
+            ends.append(bool(episode["is_terminal"][-1]))
+    assert any(ends) == (task == "Hopper-v5")
+
+
+def test_evaluation_files_and_returns_are_those_of_an_env_that_counts(tmp_path):
+    """Rewards of CountingEnv are known: n + action / 2 at step n, summed over each decision."""
+    cfg = tiny_config("dreamerv2", eval_episodes=3)
+    trainer = counting_trainer(cfg, tmp_path, length=9)
+    replay = Replay(tmp_path / "evaluation")
+    result = diswm.evaluate_agent(cfg, trainer.agent, trainer.envs, "train", replay)
+    assert recompute(tmp_path) == pytest.approx(result["returns"])
+    for index, total in enumerate(result["returns"]):
+        with np.load(replay.paths[index]) as episode:
+            held = np.repeat(episode["action"][1:, 0].astype(float), 2)[:9]
+        assert total == pytest.approx(sum(range(1, 10)) + held.sum() / 2, abs=1e-5)
+
+
+@pytest.mark.parametrize("tasks, title", [
+    ("cheetah_run-walker_walk", "cheetah_run → walker_walk"),
+    ("cheetah_run-FetchReach-v4", "cheetah_run → FetchReach-v4"),
+    ("Hopper-v5-Walker2d-v5", "Hopper-v5 → Walker2d-v5")])
+def test_plot_titles_name_both_tasks(tasks, title, tmp_path, monkeypatch):
+    """Ids of Gymnasium have a hyphen of their own."""
+    from matplotlib.axes import Axes
+    titles, real = [], Axes.set
+    monkeypatch.setattr(
+        Axes, "set", lambda self, **values: titles.append(values["title"]) or real(self, **values))
+    folder = tmp_path / tasks / "diswm" / "seed0"
+    folder.mkdir(parents=True)
+    (folder / "metrics.jsonl").write_text('{"step": 10, "eval_return": 1.0, "phase": "train"}\n')
+    succeed("plot", folder, "--out", tmp_path / "curves.png")
+    assert titles == [title]
+
+
 def test_bench_prints_times_memory_and_parameter_counts():
     """Issue 2: the parameter count is printed by part."""
     out = succeed("bench", *DEBUG)
@@ -1607,9 +1872,19 @@ def test_bench_prints_times_memory_and_parameter_counts():
 
 
 def test_doctor_renders_and_prints_versions(empty):
-    """One frame per env family, versions, device."""
+    """A frame of each family and phase, versions, device."""
     out = succeed("doctor", *DEBUG)
     assert all(text in out for text in ("python", "torch", "mujoco", "cpu"))
+    check_picture(empty / "runs/doctor.png")
+
+
+def test_doctor_names_each_family_that_fails_and_still_draws_the_others(empty, monkeypatch):
+    """A missing package is one line with its mend, a grey row, and exit 1 at the end."""
+    monkeypatch.setitem(sys.modules, "metaworld", None)  # as if it were not installed
+    code, out, err = run_cli("doctor", *DEBUG)
+    lines = [line for line in out.splitlines() if line.startswith("drawer_open:")]
+    assert code == 1 and err.count("\n") == 1 and "drawer_open" in err and "pusher" not in err
+    assert len(lines) == 1 and "pip install" in lines[0]
     check_picture(empty / "runs/doctor.png")
 
 
@@ -1856,6 +2131,29 @@ def test_wrong_usage_exits_2_and_lists_what_exists(argv, says, empty):
     """Unknown task, flag, preset, method, command or value; nothing is written."""
     refuse(*argv, code=2, says=says)
     assert not list(empty.iterdir())
+
+
+@pytest.mark.parametrize("task, says", [
+    ("CartPole-v1", "CartPole-v1"), ("Blackjack-v1", "MuJoCo"), ("Pendulum-v1", "MuJoCo")])
+def test_task_without_pixels_or_with_discrete_actions_is_one_line(task, says, empty):
+    """Issue 3: one line, the mend, exit 1; and no half-made run."""
+    refuse("finetune", "--dst", task, "--method", "dreamerv2", *DEBUG, says=(says, "choose"))
+    assert not list(empty.rglob("*.pt"))
+
+
+@pytest.mark.parametrize("near", ["FetchReach-v4", "HalfCheetah-v5", "drawer_open", "walker_walk"])
+def test_misspelt_task_suggests_the_nearest_name(near, empty):
+    """Over DMC, the Pusher, the drawers and the MuJoCo tasks of both Gymnasium packages."""
+    refuse("finetune", "--dst", near.replace("e", "ee", 1) if "e" in near else near[:-1], *DEBUG,
+           code=2, says=f"({near}")
+
+
+def test_missing_texture_is_one_line(empty, monkeypatch, tmp_path):
+    """A damaged installation of Meta-World."""
+    import metaworld
+    monkeypatch.setattr(metaworld, "__path__", [str(tmp_path)])
+    refuse("finetune", "--dst", "drawer_open", "--method", "dreamerv2", *DEBUG,
+           says=("drawer_open", "wood.png", "pip install"))
 
 
 def test_source_equal_to_target_is_refused(root):
