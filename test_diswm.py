@@ -1867,7 +1867,7 @@ def test_source_equal_to_target_is_refused(root):
 def test_teacher_with_another_latent_size_is_refused(teacher, tmp_path):
     """Eq. (3) needs the same latents on both sides; the message says the way out."""
     refuse("finetune", "--teacher", teacher, "--z-dim", 7, "--runs", tmp_path, *DEBUG,
-           says=("20 latents", "--z-dim 20"))
+           says=("another z_dim", "--z-dim 20"))
 
 
 def test_missing_teacher_file_is_refused(tmp_path):
