@@ -123,6 +123,9 @@ class Config:
     # World model, Eqs. (1), (2), (4), (5).
     encoder: str = flag("beta_vae", "image encoder and decoder; conv: DreamerV2's (paper)",
                         choices=("beta_vae", "conv"))
+    carry_over: str = flag("none", "where a video predictor's weights go: nowhere, into an agent's "
+                           "model, below its RSSM (paper)", choices=("none", "weights", "stack"))
+    bonus: float = flag(0.0, "weight of the intrinsic bonus in the reward's target (APV: 0.1)")
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1)
     cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1)
     stoch: int = flag(50, "size of the stochastic state (published)", low=1)
@@ -186,8 +189,11 @@ METHODS = {
     "diswm": {},
     "no_distill": dict(eta=0.0, eta_end=0.0),        # ablation: no latent distillation
     "no_disentangle": dict(beta=0.0, beta2=0.0),     # ablation: no β in either stage
-    "dreamerv2": dict(encoder="conv", beta=0.0, beta2=0.0, eta=0.0, eta_end=0.0),
+    "dreamerv2": dict(encoder="conv", beta=0.0, beta2=0.0, eta=0.0, eta_end=0.0,
+                      carry_over="none", bonus=0.0),
 }
+METHODS["dv2_finetune"] = METHODS["dreamerv2"] | dict(carry_over="weights")
+METHODS["apv"] = METHODS["dreamerv2"] | dict(carry_over="stack", bonus=0.1)
 
 # === Maths: pure functions of tensors =============================================================
 
@@ -393,8 +399,9 @@ class RSSM(nn.Module):
         return {key: self.norm.weight.new_zeros(batch, size) for key, size in self.sizes.items()}
 
     def recur(self, state, action):
-        """h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm."""
+        """h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm. Zeros pad an action too short."""
         x = torch.cat([state["stoch"], action], -1) if self.action_dim else state["stoch"]
+        x = F.pad(x, (0, self.inputs[0].in_features - x.shape[-1]))
         gates = self.norm(self.gru(torch.cat([self.inputs(x), state["deter"]], -1)).float())
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
@@ -429,6 +436,45 @@ class RSSM(nn.Module):
         post = {key: torch.stack([s[key] for s in states], 1) for key in state}
         return post, self.prior(post["deter"])                                # all steps at once
 
+class StackedRSSM(RSSM):
+    """APV's: it sees [embed_t, s_t of the action-free RSSM `below`], whose KL has weight 0 (APV).
+    That s_t is part of a state too, as `below` (..., S + D); imagination goes on without it."""
+
+    def __init__(self, action_dim, embed_dim, stoch=50, deter=200, hidden=200):
+        super().__init__(action_dim, embed_dim + stoch + deter, stoch, deter, hidden)
+        self.below = RSSM(0, embed_dim, stoch, deter, hidden)
+        self.sizes["below"] = stoch + deter
+
+    def step(self, state, action, embed, is_first):
+        stoch, deter = state["below"].split([self.sizes["stoch"], self.sizes["deter"]], -1)
+        below = self.feat(self.below.step(dict(stoch=stoch, deter=deter), None, embed, is_first))
+        inputs = torch.cat([embed, below], -1)
+        return super().step(state, action, inputs, is_first) | dict(below=below)
+
+class IntrinsicBonus(nn.Module):
+    """APV's reward for the unusual: mean distance to the k nearest among the latest states."""
+
+    def __init__(self, feat_dim, k=16, window=5, size=4096, dims=128, momentum=0.99):
+        super().__init__()
+        self.k, self.window, self.momentum = k, window, momentum
+        self.register_buffer("projection", torch.randn(feat_dim, dims) / dims)
+        self.register_buffer("queue", torch.zeros(size, dims))                # newest first
+        self.register_buffer("filled", torch.tensor(0))
+        self.register_buffer("scale", torch.ones(()))                         # running mean of |x|
+
+    @torch.no_grad()
+    def forward(self, feat):
+        """feat (B, T, S + D) → (B, T − window + 1): row t is of rows t … t + window − 1."""
+        means = feat.unfold(1, min(self.window, feat.shape[1]), 1).mean(-1)
+        x = (means @ self.projection).flatten(0, 1)
+        self.queue = torch.cat([x, self.queue])[:len(self.queue)]             # x counts as seen
+        self.filled += len(x)
+        # By a matrix product, ten times faster; in fp32 its rounding would drown small distances.
+        distance = torch.cdist(x.double(), self.queue[:self.filled].double()).float()
+        nearest = distance.topk(min(self.k, distance.shape[1]), largest=False).values.mean(-1)
+        self.scale.lerp_(nearest.mean(), 1 - self.momentum)
+        return (nearest / (self.scale + 1e-8)).unflatten(0, means.shape[:2])
+
 # === Video predictor and world model ==============================================================
 
 class VideoPredictor(nn.Module):
@@ -443,7 +489,8 @@ class VideoPredictor(nn.Module):
         else:
             self.encoder = ConvEncoder(cfg.cnn_depth)
             self.decoder = ConvDecoder(feat_dim, cfg.cnn_depth)
-        self.rssm = RSSM(action_dim, self.encoder.embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
+        rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
+        self.rssm = rssm(action_dim, self.encoder.embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
 
     def encode(self, image):
@@ -494,6 +541,15 @@ class WorldModel(VideoPredictor):
                            discount=cfg.discount_scale)
         self.reward = mlp(cfg.stoch + cfg.deter, cfg.units, 2, 1)
         self.discount = mlp(cfg.stoch + cfg.deter, cfg.units, 3, 1)
+        self.bonus = IntrinsicBonus(cfg.stoch + cfg.deter) if cfg.bonus else None
+
+    @torch.no_grad()
+    def carry_over(self, video):
+        """Take over a VideoPredictor's encoder, decoder and RSSM (in a stack, as the one below).
+        No actions are as good as zeros, which train no input weights: the agent's own stay."""
+        own = nn.ModuleList([self.encoder, self.decoder, getattr(self.rssm, "below", self.rssm)])
+        for weight, value in zip(own.parameters(), video.parameters(), strict=True):
+            weight[..., :value.shape[-1]] = value
 
     def predict_reward(self, feat):
         """r̂, the mean of a unit Gaussian: (..., S + D) → (...,)"""
@@ -505,7 +561,8 @@ class WorldModel(VideoPredictor):
 
     def terms(self, out, batch):
         """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
-        reward = squared_error(batch["reward"], self.predict_reward(out["feat"]))
+        feat = out["feat"][:, :batch["reward"].shape[1]]  # the last rows have no intrinsic bonus
+        reward = squared_error(batch["reward"], self.predict_reward(feat))
         # DEVIATION: the discount head of Eq. (4) is trained; the published code switches it off.
         logit, target = self.predict_discount(out["feat"]), self.cfg.gamma * batch["discount"]
         discount = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
@@ -622,7 +679,7 @@ class Agent:
 
     def __init__(self, cfg, action_dim, device, teacher=None):
         self.cfg, self.action_dim, self.device, self.teacher = cfg, action_dim, device, teacher
-        self.model = WorldModel(cfg, action_dim).to(device)
+        self.model = WorldModel(cfg, padded_actions(cfg, action_dim)).to(device)
         self.behaviour = ActorCritic(cfg, action_dim).to(device)
         self.optimizers = dict(model=adam(self.model, cfg.model_lr),
                                actor=adam(self.behaviour.actor, cfg.actor_lr),
@@ -655,6 +712,10 @@ class Agent:
         optimizers, clip = self.optimizers, self.cfg.grad_clip
         with autocast(cfg):
             out = self.model(batch)
+        if self.model.bonus:                                                  # in fp32
+            bonus = self.model.bonus(out["post"].get("below", out["feat"]))
+            batch["reward"] = batch["reward"][:, :bonus.shape[1]] + cfg.bonus * bonus
+        with autocast(cfg):
             loss, metrics = self.model.loss(out, batch, self.teach(batch["image"]), eta)
         if probe and "distill" in metrics:
             grads = torch.autograd.grad(eta * metrics["distill"],
@@ -1132,6 +1193,13 @@ def config_envs(cfg, task, **kwargs):
         return gym.vector.SyncVectorEnv(make)
     return gym.vector.AsyncVectorEnv(make, context="spawn")                   # EGL hangs in a fork
 
+def padded_actions(cfg, action_dim):
+    """Actions of a world model: the more of both tasks' where it carries weights over (paper)."""
+    if cfg.carry_over != "weights":
+        return action_dim
+    with contextlib.closing(make_env(cfg.src, pixels=False)) as env:
+        return max(action_dim, *env.action_space.shape)
+
 def episode_seed(seed, stream, index):
     """Of the run's seed, the purpose and the index."""
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
@@ -1438,13 +1506,18 @@ def announce(cfg, stage, folder, frames):
 
 def train_agent(cfg, stage, fresh):
     """Train an agent in `cfg.dst` from where it stopped. Returns the run's folder."""
-    run, device, teacher = Run(cfg, stage, fresh), torch.device(cfg.device), None
-    if cfg.eta > 0:
-        saved = run.state and run.state["trainer"]
-        teacher = saved_teacher(saved, cfg, device) if saved else find_teacher(cfg, device)
+    run, device = Run(cfg, stage, fresh), torch.device(cfg.device)
+    video = teacher = None
+    if run.state:
+        teacher = saved_teacher(run.state["trainer"], cfg, device)
+    elif cfg.eta > 0 or cfg.carry_over != "none":
+        video = find_teacher(cfg, device)
+        teacher = freeze(video.encoder) if cfg.eta > 0 else None
     announce(cfg, stage, run.folder, cfg.steps // cfg.action_repeat)
     torch.manual_seed(cfg.seed)
     trainer = AgentTrainer(run.cfg, run.folder, device, teacher)
+    if video and cfg.carry_over != "none":
+        trainer.agent.model.carry_over(video)
     with contextlib.closing(trainer.envs):
         train(trainer, run)
     return run.folder
@@ -1479,7 +1552,7 @@ def finetune(cfg, fresh=False):
     train_agent(cfg, "finetune", fresh)
 
 def find_teacher(cfg, device):
-    """The frozen encoder of a video predictor: --teacher, or the one of --src and this method.
+    """A video predictor to learn from: --teacher, or the one of --src and this method.
     Prefers the run's own seed, else the first. Raises UserError with the command that makes one."""
     own = run_folder(cfg, "pretrain")
     found = [own / "checkpoint.pt", *sorted(own.parent.glob("seed*/checkpoint.pt"))]
@@ -1493,18 +1566,20 @@ def find_teacher(cfg, device):
                         + (f" (or take one that exists: --src {min(others)})" if others else ""))
     state = read_checkpoint(path)
     saved, done = state["config"], state["trainer"].get("progress")
-    if state["stage"] != "pretrain" or saved.encoder != "beta_vae":
+    if state["stage"] != "pretrain" or saved.encoder != ("beta_vae" if cfg.eta else cfg.encoder):
         raise UserError(f"{path} is a {saved.encoder} {state['stage']} run, no teacher; {command}")
     if saved.src == cfg.dst:
         raise UserError(f"{path} saw videos of the target, {cfg.dst}; choose another --src")
-    if (z := saved.z_dim) != cfg.z_dim:
-        raise UserError(f"{path} has {z} latents, this run {cfg.z_dim}; add --z-dim {z}")
+    more = () if cfg.carry_over == "none" else ("cnn_depth", "stoch", "deter", "hidden")
+    for name in ("z_dim", *more):
+        if (size := getattr(saved, name)) != getattr(cfg, name):
+            raise UserError(f"{path} has another {name}; add --{name.replace('_', '-')} {size}")
     if done < saved.pretrain_updates:
         raise UserError(f"{path} is not finished ({done} of {saved.pretrain_updates}); {command}")
     print(f"teacher: {path} ({saved.src}, {done:,} updates)")
     model = VideoPredictor(saved)
     model.load_state_dict(state["trainer"]["model"])
-    return freeze(model.encoder.to(device))
+    return model.to(device)
 
 def saved_teacher(trainer, cfg, device):
     """The frozen teacher that an agent's checkpoint carries, or None."""
@@ -1624,7 +1699,7 @@ def traverse(folder, device):
         frames = range(0, strip.shape[1], 4)
         draw_grid(strip[:, ::4], ("truth", "model", "error"), frames, folder / "open_loop.png",
                   "open-loop prediction: frames 5 … are predicted, not seen")
-        if cfg.encoder == "beta_vae":
+        if cfg.encoder == "beta_vae" and not isinstance(model.rssm, StackedRSSM):
             pictures, nats = latent_traversal(model, batch)
             order = np.argsort(-nats)                                         # informative first
             draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats" for i in order],

@@ -7,6 +7,7 @@ production code through the module.
 """
 
 import contextlib
+import copy
 import dataclasses
 import errno
 import functools
@@ -729,13 +730,16 @@ def gets_gradient(modules):
 @pytest.mark.parametrize("distill", ["softmax", "gaussian"])
 @pytest.mark.parametrize("method", METHODS)
 def test_every_trainable_parameter_of_its_stage_gets_a_gradient_and_no_other_does(method, distill):
-    """Pretraining trains the whole predictor; an agent's update all but teacher and slow critic."""
+    """Pretraining trains the whole predictor; an agent's update all but teacher and slow critic.
+    APV no longer needs the prior of its action-free RSSM: the weight of that KL is 0."""
     cfg = tiny_config(method, free_nats=0.0, distill=distill, grad_clip=1e9)
     agent = make_agent(cfg)
     metrics, behaviour = agent.update(fake_batch(), cfg.eta, 0), agent.behaviour
     got, named = gets_gradient([agent.model, behaviour.actor, behaviour.critic])
-    assert got == named
-    norm = torch.stack([p.grad.norm() for p in agent.model.parameters()]).norm()
+    unused = {name for name in named if ".below.prior_net." in name}
+    assert got == named - unused and bool(unused) == (method == "apv")
+    grads = [p.grad.norm() for p in agent.model.parameters() if p.grad is not None]
+    norm = torch.stack(grads).norm()
     torch.testing.assert_close(norm, metrics["model_grad_norm"])  # none from the behaviour's
     for fixed in filter(None, [agent.teacher, behaviour.slow_critic]):
         assert all(p.grad is None for p in fixed.parameters())
@@ -797,10 +801,10 @@ def test_the_terms_are_the_negative_log_likelihoods_of_equations_4_and_5():
 
 # === RSSM =========================================================================================
 
-def window(seed, batch=3, length=6, action_dim=2):
+def window(seed, batch=3, length=6, action_dim=2, kind="RSSM"):
     """An RSSM and a window: embed, action, is_first."""
     torch.manual_seed(seed)
-    rssm = diswm.RSSM(action_dim, 4, stoch=3, deter=5, hidden=6).requires_grad_(False)
+    rssm = getattr(diswm, kind)(action_dim, 4, stoch=3, deter=5, hidden=6).requires_grad_(False)
     first = torch.zeros(batch, length, dtype=torch.bool)
     first[:, 0] = True
     return rssm, torch.randn(batch, length, 4), torch.randn(batch, length, action_dim), first
@@ -824,10 +828,14 @@ def pick(state, index):
     return {key: value[index] for key, value in state.items()}
 
 
+both_kinds = pytest.mark.parametrize("kind", ["RSSM", "StackedRSSM"])
+
+
+@both_kinds
 @given(seeds, sizes, sizes)
-def test_filtering_a_window_equals_filtering_step_by_step(seed, batch, length):
+def test_filtering_a_window_equals_filtering_step_by_step(kind, seed, batch, length):
     """Training (observe) and acting (step) are one filter; priors come from the same h_t."""
-    rssm, embed, action, first = window(seed, batch, length)
+    rssm, embed, action, first = window(seed, batch, length, kind=kind)
     with no_noise():
         post, prior = rssm.observe(embed, action, first)
         state = rssm.initial(batch)
@@ -837,9 +845,9 @@ def test_filtering_a_window_equals_filtering_step_by_step(seed, batch, length):
             assert close(rssm.prior(state["deter"]), pick(prior, (slice(None), t)))
 
 
-def check_is_first_forgets_everything(seed=0, seam=3):
+def check_is_first_forgets_everything(seed=0, seam=3, kind="RSSM"):
     """From a seam on, a window gives the states of a window that starts there, action included."""
-    rssm, embed, action, first = window(seed)
+    rssm, embed, action, first = window(seed, kind=kind)
     first[:, seam] = True
     with no_noise():
         post, _ = rssm.observe(embed, action, first)
@@ -848,16 +856,18 @@ def check_is_first_forgets_everything(seed=0, seam=3):
     assert close(pick(post, (slice(None), slice(seam, None))), alone)
 
 
+@both_kinds
 @given(seeds, st.integers(1, 5))
-def test_is_first_forgets_the_state_and_the_previous_action(seed, seam):
+def test_is_first_forgets_the_state_and_the_previous_action(kind, seed, seam):
     """A window across a seam equals two windows."""
-    check_is_first_forgets_everything(seed, seam)
+    check_is_first_forgets_everything(seed, seam, kind)
 
 
+@both_kinds
 @given(seeds, st.integers(1, 5))
-def test_filtering_is_causal_and_priors_do_not_see_their_own_image(seed, t):
+def test_filtering_is_causal_and_priors_do_not_see_their_own_image(kind, seed, t):
     """Row t's image changes posteriors from t, priors from t + 1; row t's action both from t on."""
-    rssm, embed, action, first = window(seed)
+    rssm, embed, action, first = window(seed, kind=kind)
     other_embed, other_action = embed.clone(), action.clone()
     other_embed[:, t] += 3
     other_action[:, t] += 3
@@ -873,10 +883,11 @@ def test_filtering_is_causal_and_priors_do_not_see_their_own_image(seed, t):
     assert [change(0, by_action), change(1, by_action)] == [t, t]
 
 
+@both_kinds
 @given(seeds, st.permutations(range(3)))
-def test_permuting_the_batch_permutes_the_states(seed, order):
+def test_permuting_the_batch_permutes_the_states(kind, seed, order):
     """Windows do not see each other."""
-    rssm, embed, action, first = window(seed)
+    rssm, embed, action, first = window(seed, kind=kind)
     first[1, 2] = True
     order = list(order)
     with no_noise():
@@ -923,6 +934,196 @@ def test_latents_are_sampled_not_means():
         assert torch.equal(one["code"]["mean"], two["code"]["mean"])
         assert not torch.allclose(one["embed"], two["embed"])
         assert not torch.allclose(one["post"]["stoch"], one["post"]["mean"])
+
+
+# === Baselines: stack, intrinsic bonus, weights carried over ======================================
+
+def check_stack_is_two_rssms(seed=0):
+    """The state below is an action-free RSSM's of embed; the one above sees [embed, below]."""
+    stack, embed, action, first = window(seed, kind="StackedRSSM")
+    first[1, 3] = True
+    with no_noise():
+        post, prior = stack.observe(embed, action, first)
+        below, _ = stack.below.observe(embed, None, first)
+        feat = torch.cat([below["stoch"], below["deter"]], -1)
+        above = diswm.RSSM(2, 4 + 3 + 5, stoch=3, deter=5, hidden=6)
+        weights = {key: x for key, x in stack.state_dict().items() if "below" not in key}
+        above.load_state_dict(weights)
+        states = above.observe(torch.cat([embed, feat], -1), action, first)
+    assert torch.allclose(post["below"], feat, atol=1e-6)
+    assert close(states[0], post) and close(states[1], prior)
+
+
+@given(seeds)
+def test_the_stack_is_an_action_free_rssm_under_one_that_sees_its_states(seed):
+    """APV, section 4.2: q(s_t | s_{t−1}, a_{t−1}, z_t) on top of q(z_t | z_{t−1}, o_t)."""
+    check_stack_is_two_rssms(seed)
+
+
+def test_imagination_goes_on_without_the_rssm_below():
+    """Its video-only state cannot be imagined under actions; only the upper one is (APV)."""
+    agent = make_agent(tiny_config("apv"))
+    start = {key: torch.randn_like(x) for key, x in agent.model.rssm.initial(4).items()}
+    other = start | {"below": torch.randn_like(start["below"])}
+    with no_noise():
+        feats, _, _ = agent.behaviour.imagine(agent.model, start)
+        again, _, _ = agent.behaviour.imagine(agent.model, other)
+    assert torch.equal(feats, again)
+
+
+class BonusOracle:
+    """APV's bonus by brute force, in numpy: loops over windows, sorted distances, a plain list."""
+
+    def __init__(self, projection, k, window, size, momentum):
+        self.projection, self.k, self.window = projection.double().numpy(), k, window
+        self.size, self.momentum, self.seen, self.scale = size, momentum, [], 1.0
+
+    def __call__(self, feat):
+        rows, length = feat.shape[0], feat.shape[1] - self.window + 1
+        new = [feat[b, t:t + self.window].double().numpy().mean(0) @ self.projection
+               for b in range(rows) for t in range(length)]
+        self.seen = (new + self.seen)[:self.size]
+        far = [np.mean(sorted(np.linalg.norm(x - y) for y in self.seen)[:self.k]) for x in new]
+        self.scale = self.momentum * self.scale + (1 - self.momentum) * np.mean(far)
+        return np.reshape(far, (rows, length)) / self.scale
+
+
+def check_bonus_is_the_brute_force_one(seed=0, k=3, window=2, size=20, batch=2, length=5):
+    """Bonus, queue and running mean over four batches; the queue overflows in the last ones."""
+    torch.manual_seed(seed)
+    bonus = diswm.IntrinsicBonus(6, k, window, size, dims=4, momentum=0.9)
+    oracle = BonusOracle(bonus.projection, k, window, size, 0.9)
+    for _ in range(4):
+        feat = torch.randn(batch, length, 6)
+        np.testing.assert_allclose(bonus(feat).numpy(), oracle(feat), rtol=1e-4, atol=1e-6)
+        count = len(oracle.seen)
+        np.testing.assert_allclose(bonus.queue[:count].numpy(), oracle.seen, rtol=1e-4, atol=1e-6)
+        assert bonus.scale.item() == pytest.approx(oracle.scale, rel=1e-5)
+        assert bonus.queue.shape == (size, 4) and not bonus.queue[count:].any()
+
+
+@given(seeds, sizes, st.integers(1, 4), st.integers(1, 40), sizes, st.integers(4, 7))
+def test_the_bonus_is_the_normalised_mean_distance_to_the_k_nearest_neighbours(
+        seed, k, window, size, batch, length):
+    """Of window means, projected, among the newest of the queue, the batch at hand included."""
+    check_bonus_is_the_brute_force_one(seed, k, window, size, batch, length)
+
+
+def test_the_bonus_keeps_its_digits_for_near_neighbours_far_from_zero():
+    """A float32 matrix product would lose distances a thousand times smaller than the states."""
+    torch.manual_seed(0)
+    bonus = diswm.IntrinsicBonus(6, dims=4)
+    oracle = BonusOracle(bonus.projection, 16, 5, 4096, 0.99)
+    feat = 10 + 0.01 * torch.randn(6, 9, 6)
+    np.testing.assert_allclose(bonus(feat).numpy(), oracle(feat), rtol=0.01)
+
+
+def test_the_bonus_is_data_with_apvs_constants():
+    """k 16, windows of 5, 4096 entries of 128, projection of std 1/128, momentum 0.99, weight 0.1;
+    a window too short for one of 5 is one itself."""
+    torch.manual_seed(0)
+    bonus = diswm.IntrinsicBonus(250)
+    assert (bonus.k, bonus.window, bonus.momentum) == (16, 5, 0.99)
+    assert bonus.queue.shape == (4096, 128) and METHODS["apv"]["bonus"] == 0.1
+    assert bonus.projection.std().item() == pytest.approx(1 / 128, rel=0.02)
+    assert not list(bonus.parameters())
+    reward = bonus(leaf(torch.randn(3, 9, 250)))
+    assert reward.shape == (3, 5) and not reward.requires_grad
+    assert bonus(torch.randn(2, 3, 250)).shape == (2, 1)
+
+
+@pytest.mark.parametrize("carry_over", ["stack", "none"])
+def test_the_bonus_is_added_to_the_rewards_target_and_the_last_rows_have_none(carry_over):
+    """r + 0.1 · bonus of s_t below, for the rows that begin a window of 5; the others train no
+    reward. Without a stack it looks at the model's own states."""
+    agent, seen = make_agent(tiny_config("apv", carry_over=carry_over)), {}
+    fresh, loss = copy.deepcopy(agent.model.bonus), agent.model.loss
+
+    def spy(out, batch, teacher, eta):
+        seen.update(out=out, reward=batch["reward"], terms=agent.model.terms(out, batch),
+                    prediction=agent.model.predict_reward(out["feat"])[:, :4])
+        return loss(out, batch, teacher, eta)
+    agent.model.loss, data = spy, fake_batch()
+    agent.update(data, 0.0, 0)
+    out, reward = seen["out"], seen["reward"]
+    feat = out["post"]["below"] if carry_over == "stack" else out["feat"]
+    expected = torch.from_numpy(data["reward"])[:, :4] + 0.1 * fresh(feat)
+    torch.testing.assert_close(reward, expected)
+    assert (expected > torch.from_numpy(data["reward"])[:, :4]).all()
+    error = 0.5 * (seen["prediction"] - expected) ** 2
+    torch.testing.assert_close(seen["terms"]["reward"], error)
+    assert seen["terms"]["discount"].shape == (3, 8)
+
+
+def test_no_actions_are_the_same_as_zero_actions():
+    """Why dv2_finetune's video model, trained with zero actions, needs none: the same states, and
+    no gradient at the actions' input weights, which therefore keep their initial values."""
+    free, embed, action, first = window(0, action_dim=0)
+    padded = diswm.RSSM(4, 4, stoch=3, deter=5, hidden=6)
+    weights = free.state_dict()
+    columns = torch.randn(6, 4)
+    weights["inputs.0.weight"] = torch.cat([weights["inputs.0.weight"], columns], 1)
+    padded.load_state_dict(weights)
+    with no_noise():
+        states, _ = padded.observe(embed, torch.zeros(3, 6, 4), first)
+        assert close(states, free.observe(embed, None, first)[0])
+    states["stoch"].sum().backward()
+    assert not padded.inputs[0].weight.grad[:, 3:].any()
+    assert padded.inputs[0].weight.grad[:, :3].any()
+
+
+@pytest.mark.parametrize("src, dst, padded", [
+    ("cheetah_run", "cartpole_swingup", 6), ("cartpole_swingup", "walker_walk", 6),
+    ("cartpole_swingup", "reacher_easy", 2), ("walker_walk", "cheetah_run", 6)])
+def test_dv2_finetune_pads_actions_to_the_larger_of_both_tasks(src, dst, padded):
+    """Paper, appendix: "the maximum action space of both environments". The actor has its own."""
+    own = TASK_ACTIONS[dst]
+    agent = make_agent(tiny_config("dv2_finetune", src=src, dst=dst), own)
+    assert agent.model.rssm.action_dim == padded and agent.action_dim == own
+    assert agent.behaviour.actor[-1].out_features == 2 * own
+    for method in METHODS.keys() - {"dv2_finetune"}:
+        assert make_agent(tiny_config(method, src=src, dst=dst), own).model.rssm.action_dim == own
+
+
+TASK_ACTIONS = dict(walker_walk=6, cartpole_swingup=1, reacher_easy=2, cheetah_run=6)
+
+
+def check_padded_actions_never_leak():
+    """Other weights at the padded entries change no metric, state or action, and stay untouched."""
+    cfg = tiny_config("dv2_finetune", dst="reacher_easy")  # 2 actions of the 6 of cheetah_run
+    batch, results = fake_batch(), []
+    image = batch["image"][:, 0]
+    for shift in (0, 100):
+        agent = make_agent(cfg)
+        weight = agent.model.rssm.inputs[0].weight
+        with torch.no_grad():
+            weight[:, cfg.stoch + 2:] = weight[:, cfg.stoch + 2:].flip(1) + shift
+        before = weight[:, cfg.stoch + 2:].clone()
+        torch.manual_seed(1)
+        metrics = [agent.update(batch, 0.0, update) for update in range(2)]
+        action, state = agent.act(image, np.zeros((3, 2), np.float32), None, explore=True)
+        action, state = agent.act(image, action, state, explore=True)
+        _, log_prob, entropy = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(3))
+        results.append(dict(metrics=metrics, action=action.tolist(), state=state,
+                            imagined=dict(log_prob=log_prob, entropy=entropy)))
+        assert action.shape == (3, 2) and not weight.grad[:, cfg.stoch + 2:].any()
+        assert torch.equal(weight[:, cfg.stoch + 2:], before)
+    assert_identical(*results)
+
+
+def test_padded_actions_are_zero_in_the_model_and_reach_nothing_else():
+    """Neither the env's actions nor log-probs, entropies, losses or weights know of them."""
+    check_padded_actions_never_leak()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_collecting_is_dreamerv2_whichever_method_asks_for_videos(method, monkeypatch):
+    """One video set serves all methods: nothing of theirs may reach the agent that collects."""
+    asked = []
+    monkeypatch.setattr(diswm, "train_agent", lambda cfg, *args: asked.append(cfg))
+    for name in (method, "dreamerv2"):
+        diswm.collect(tiny_config(name))
+    assert asked[0] == asked[1] and asked[0].carry_over == "none" and asked[0].eta == 0
 
 
 # === Replay =======================================================================================
@@ -1609,6 +1810,10 @@ def empty(tmp_path, monkeypatch):
     (("finetune", "--dst", "walker_walk"), "python diswm.py pretrain --src cheetah_run"),
     (("finetune", "--dst", "walker_walk", "--method", "no_disentangle"),
      "python diswm.py pretrain --src cheetah_run --method no_disentangle"),
+    (("finetune", "--dst", "walker_walk", "--method", "dv2_finetune"),
+     "python diswm.py pretrain --src cheetah_run --method dv2_finetune"),
+    (("finetune", "--dst", "walker_walk", "--method", "apv"),
+     "python diswm.py pretrain --src cheetah_run --method apv"),
     (("pretrain", "--videos", "."), "python diswm.py collect"),
     (("evaluate", "--run", RUN), "checkpoint"),
     (("traverse", "--run", RUN), "checkpoint"),
@@ -1638,6 +1843,98 @@ def test_finetune_refuses_a_policy_as_a_teacher(finished, tmp_path):
     """--teacher takes a pretrain checkpoint."""
     refuse("finetune", "--teacher", finished / "checkpoint.pt", "--runs", tmp_path / "runs", *DEBUG,
            says="python diswm.py pretrain --src cheetah_run")
+
+
+@pytest.fixture(scope="session", params=["dv2_finetune", "apv"])
+def carried(request, root, tmp_path_factory):
+    """A method that carries weights over, and its finished pretraining."""
+    runs = tmp_path_factory.mktemp(request.param)
+    succeed("pretrain", "--src", "cheetah_run", "--method", request.param, "--runs", runs,
+            "--videos", next((root / "runs/collect").rglob("episodes")), *DEBUG)
+    return request.param, runs / f"pretrain/cheetah_run/{request.param}/seed0/checkpoint.pt"
+
+
+def carried_command(carried, runs):
+    """From 6 actions to 1."""
+    method, video = carried
+    return ("finetune", "--dst", "cartpole_swingup", "--method", method, "--teacher", video,
+            "--runs", runs, *CUT_FLAGS)
+
+
+def test_exactly_the_pretrained_weights_are_carried_over_and_the_rest_is_fresh(carried, tmp_path):
+    """At update 0: encoder, image decoder and RSSM (in a stack, below) are the video predictor's;
+    heads, actor, critic, RSSM above and input weights of actions are an untrained agent's."""
+    interrupt(diswm.ActionRepeat, "step", 1, carried_command(carried, tmp_path))
+    state = torch.load(next(tmp_path.rglob("checkpoint.pt")), weights_only=True)
+    video = torch.load(carried[1], weights_only=True)["trainer"]["model"]
+    fresh = make_agent(diswm.Config(**state["config"]), 1).state_dict()
+    agent, below = state["trainer"]["agent"], "rssm.below." if carried[0] == "apv" else "rssm."
+    video = {key.replace("rssm.", below): value for key, value in video.items()}
+    assert video.keys() < agent["model"].keys()
+    for key, value in agent["model"].items():
+        source, width = fresh["model"][key].clone(), 0
+        if key in video:
+            width = video[key].shape[-1]
+            source[..., :width] = video[key]
+            assert width == value.shape[-1] or key == "rssm.inputs.0.weight"
+        assert torch.equal(value, source), key
+    assert_identical(agent["behaviour"], fresh["behaviour"])
+    assert state["trainer"]["teacher"] is None
+
+
+def test_run_that_carried_weights_over_resumes_bit_for_bit_without_the_pretraining(
+        carried, tmp_path):
+    """Weights, Adam, and APV's queue, projection and running mean are all in the checkpoint."""
+    one, two, video = tmp_path / "one", tmp_path / "two", tmp_path / "video.pt"
+    shutil.copy(carried[1], video)
+    succeed(*carried_command(carried, one))
+    argv = carried_command((carried[0], video), two)
+    interrupt(diswm.ActionRepeat, "step", 90, argv)
+    model = torch.load(next(two.rglob("checkpoint.pt")), weights_only=True)["trainer"]["agent"]
+    saved = {key.removeprefix("bonus.") for key in model["model"] if key.startswith("bonus.")}
+    if carried[0] == "apv":
+        assert saved == {"queue", "filled", "projection", "scale"}
+        assert model["model"]["bonus.filled"] > 0 and model["model"]["bonus.scale"] < 1
+    video.unlink()
+    succeed(*argv)
+    assert_identical(*(everything(next(runs.rglob("seed0"))) for runs in (one, two)))
+
+
+def test_pipeline_of_methods_that_carry_weights_over(carried):
+    """pretrain → finetune → evaluate → traverse on real DMC, from 6 actions to 1; bench."""
+    method, video = carried
+    runs = video.parents[4]
+    argv = ("finetune", "--dst", "cartpole_swingup", "--method", method, "--runs", runs, *DEBUG)
+    assert str(video) in succeed(*argv, "--steps", 120)  # found by itself
+    folder = runs / f"finetune/cheetah_run-cartpole_swingup/{method}/seed0"
+    with np.load(folder / "episodes/000000.npz") as episode:
+        assert episode["action"].shape[1] == 1
+    values = {key: value for row in read_rows(folder) for key, value in row.items()}
+    assert "distill" not in values and np.isfinite(values["reward"])
+    succeed("evaluate", "--run", folder)
+    for run in (folder, video.parent):
+        succeed("traverse", "--run", run)
+        check_picture(run / "open_loop.png")
+    assert "world_model" in succeed("bench", "--method", method, *DEBUG)
+
+
+def test_carrying_over_refuses_what_does_not_fit(carried, teacher, tmp_path):
+    """Another architecture is one line: a β-VAE's weights, or other sizes, with the way out."""
+    argv = ("finetune", "--method", carried[0], "--runs", tmp_path, *DEBUG, "--teacher")
+    refuse(*argv, teacher, says=("beta_vae", f"pretrain --src cheetah_run --method {carried[0]}"))
+    refuse(*argv, carried[1], "--cnn-depth", 5, says=("another cnn_depth", "--cnn-depth 4"))
+    refuse(*argv, carried[1], "--stoch", 7, says=("another stoch", "--stoch 6"))
+    refuse(*argv, carried[1], "--eta", 0.1, says="no teacher")
+    assert not list(tmp_path.rglob("*.pt"))
+
+
+def test_a_teacher_may_also_give_its_weights(teacher, tmp_path):
+    """Settings combine: distillation from β-VAE latents into a model that starts from them."""
+    succeed("finetune", "--dst", "cartpole_swingup", "--carry-over", "stack", "--bonus", 0.1,
+            "--teacher", teacher, "--runs", tmp_path, *DEBUG, "--steps", 120)
+    folder = next(tmp_path.rglob("seed0"))
+    assert any("distill" in row for row in read_rows(folder))
+    succeed("traverse", "--run", folder)
 
 
 def test_pretraining_sees_only_images_and_where_episodes_begin(root, tmp_path):
@@ -2168,7 +2465,7 @@ def test_source_equal_to_target_is_refused(root):
 def test_teacher_with_another_latent_size_is_refused(teacher, tmp_path):
     """Eq. (3) needs the same latents on both sides; the message says the way out."""
     refuse("finetune", "--teacher", teacher, "--z-dim", 7, "--runs", tmp_path, *DEBUG,
-           says=("20 latents", "--z-dim 20"))
+           says=("another z_dim", "--z-dim 20"))
 
 
 def test_missing_teacher_file_is_refused(tmp_path):
