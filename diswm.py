@@ -48,7 +48,6 @@ import signal
 import statistics
 import struct
 import sys
-import threading
 import time
 import timeit
 import tokenize
@@ -130,11 +129,10 @@ class Config:
     stoch: int = flag(50, "size of the stochastic state (published)", low=1, high=10_000)
     deter: int = flag(200, "size of the deterministic state (published)", low=1, high=10_000)
     hidden: int = flag(200, "hidden units inside the RSSM (published)", low=1, high=10_000)
-    units: int = flag(400, "hidden units of heads, actor and critic (published)", low=1,
-                     high=10_000)
+    units: int = flag(400, "hidden units of heads and actor-critic (published)", low=1, high=10_000)
     batch_size: int = flag(50, "windows per batch, B (table)", low=1)
     batch_length: int = flag(50, "rows per window, T (table)", low=2)
-    model_lr: float = flag(3e-4, "learning rate of video predictor and world model (table)")
+    model_lr: float = flag(3e-4, "learning rate of video predictor and world model (table)", high=1)
     alpha: float = flag(1.0, "α, weight of the KL in Eq. (5) (table)")
     beta1: float = flag(1.0, "β₁, weight of the action-free KL in Eq. (2) (table)")
     beta: float = flag(0.015, "β, weight of the disentanglement loss in Eq. (5) (table)")
@@ -157,8 +155,8 @@ class Config:
     lambda_: float = flag(0.95, "λ of the λ-return (table)", high=1)
     rho: float = flag(1.0, "ρ: 1 dynamics backprop, 0 REINFORCE (published)", high=1)
     entropy_scale: float = flag(1e-4, "weight of the actor's entropy (published)")
-    actor_lr: float = flag(8e-5, "learning rate of the actor (table)")
-    critic_lr: float = flag(8e-5, "learning rate of the critic (table)")
+    actor_lr: float = flag(8e-5, "learning rate of the actor (table)", high=1)
+    critic_lr: float = flag(8e-5, "learning rate of the critic (table)", high=1)
     slow_every: int = flag(100, "updates between copies to the slow critic (published)", low=1)
     grad_clip: float = flag(100.0, "largest gradient norm of each optimiser (published)")
     # Machine.
@@ -751,9 +749,9 @@ def npz_layout(path, keys, plain=True):
     The offset of an array that is compressed, or in Fortran's order, is None. Raises UserError
     unless `keys` are arrays as make_row has them, a row for each image uint8 (64, 64, 3); `plain`:
     and have an offset. Nothing is unpacked: a zip bomb is refused by the size that it declares."""
-    layout, kind = {}, f"episode with {', '.join(keys)}"
-    with (reading(path, kind, "remove it and run again"), zipfile.ZipFile(path) as archive,
-          open(path, "rb") as file):
+    layout = {}
+    with (reading(path, f"episode with {', '.join(keys)}", "remove it and run again"),
+          zipfile.ZipFile(path) as archive, open(path, "rb") as file):
         for info in archive.infolist():
             if info.file_size > max(2**30, 100 * info.compress_size):
                 raise ValueError(f"{info.filename} would unpack to {info.file_size:,} bytes")
@@ -1125,7 +1123,7 @@ class Run:
                 torch.cuda.set_rng_state(self.state["rng"]["cuda"])
             if self.log_path.exists():
                 if not 0 <= self.state["log_bytes"] <= self.log_path.stat().st_size:
-                    raise ValueError(f"{self.log_path} is shorter than it was then")
+                    raise ValueError(f"{self.log_path.name} is shorter than it was then")
                 os.truncate(self.log_path, self.state["log_bytes"])          # the rest comes again
 
 @contextlib.contextmanager
@@ -1140,7 +1138,7 @@ def stop_requests():
         os.write(2, b"finishing this episode or update, then saving; again to stop now\n")
     with contextlib.ExitStack() as handlers:
         for number in (signal.SIGTERM, signal.SIGINT):
-            if threading.current_thread() is threading.main_thread():         # others may not
+            with contextlib.suppress(ValueError):             # a thread may not have handlers
                 handlers.callback(signal.signal, number, signal.signal(number, note))
         yield received
 
@@ -1520,14 +1518,13 @@ def traverse(folder, device, videos=""):
     which may be a stranger's, could name."""
     folder = Path(folder)
     cfg, model, _ = load_model(folder, device)
-    collected = (folder / "../../../..").glob(f"collect/{cfg.src}/*/seed*/episodes")
-    places = [Path(videos)] if videos else [folder / "episodes", folder / "videos", *collected]
-    place = next((place for place in places if any(place.glob("*.npz"))), None)
-    if place is None:
-        raise UserError(f"{folder} has no episodes to draw from; name some with --videos")
-    online = isinstance(model, Agent)
-    replay = Replay(place, keys=tuple(ROW) if online else VIDEO_KEYS)
+    online, collected = isinstance(model, Agent), f"collect/{cfg.src}/*/seed*/episodes"
+    places = [folder / "videos", *(folder / "../../../..").glob(collected)]
+    place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
+    replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
     model = model.model if online else model
+    if not replay.rows:
+        raise UserError(f"no episodes in {replay.folder}; nothing to draw from (see --videos)")
     # From the middle of the last episode: the colours of the end, and a pose that is not the start.
     start = ([0, *replay.ends][-2] + replay.rows) // 2
     window = replay.window(start, min(50, replay.rows - start))
