@@ -35,6 +35,7 @@ import ctypes
 import dataclasses
 import difflib
 import functools
+import fcntl
 import io
 import json
 import math
@@ -44,6 +45,7 @@ import platform
 import re
 import resource
 import shutil
+import signal
 import statistics
 import struct
 import sys
@@ -63,6 +65,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
+from torch.utils._pytree import tree_leaves
 from tqdm import tqdm
 
 GL_HINT = "run: apt-get install libegl1 libgl1-mesa-dri, or libosmesa6 and export MUJOCO_GL=osmesa"
@@ -81,9 +84,9 @@ class UserError(Exception):
 
 # === Config =======================================================================================
 
-def flag(default, help, *, low=0, choices=None, free=False):
-    """A Config field and its flag. low: the least number; free: may change on resuming."""
-    meta = dict(help=help, low=low, choices=choices, free=free)
+def flag(default, help, *, low=0, high=10**12, choices=None, free=False):
+    """A Config field and its flag. low, high: of numbers; free: may change on resuming."""
+    meta = dict(help=help, low=low, high=high, choices=choices, free=free)
     return dataclasses.field(default=default, metadata=meta)
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class Config:
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
     colors: str = flag("published", "colour boxes around fixed centres, or the original colours "
                        "(published; paper)", choices=("published", "original"))
-    color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)")
+    color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)", high=1)
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
     envs: int = flag(1, "environments side by side, beyond one a process each (ours)", low=1)
@@ -126,20 +129,20 @@ class Config:
     carry_over: str = flag("none", "where a video predictor's weights go: nowhere, into an agent's "
                            "model, below its RSSM (paper)", choices=("none", "weights", "stack"))
     bonus: float = flag(0.0, "weight of the intrinsic bonus in the reward's target (APV: 0.1)")
-    z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1)
-    cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1)
-    stoch: int = flag(50, "size of the stochastic state (published)", low=1)
-    deter: int = flag(200, "size of the deterministic state (published)", low=1)
-    hidden: int = flag(200, "hidden units inside the RSSM (published)", low=1)
-    units: int = flag(400, "hidden units of heads, actor and critic (published)", low=1)
+    z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1, high=10_000)
+    cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=10_000)
+    stoch: int = flag(50, "size of the stochastic state (published)", low=1, high=10_000)
+    deter: int = flag(200, "size of the deterministic state (published)", low=1, high=10_000)
+    hidden: int = flag(200, "hidden units inside the RSSM (published)", low=1, high=10_000)
+    units: int = flag(400, "hidden units of heads and actor-critic (published)", low=1, high=10_000)
     batch_size: int = flag(50, "windows per batch, B (table)", low=1)
     batch_length: int = flag(50, "rows per window, T (table)", low=2)
-    model_lr: float = flag(3e-4, "learning rate of video predictor and world model (table)")
+    model_lr: float = flag(3e-4, "learning rate of video predictor and world model (table)", high=1)
     alpha: float = flag(1.0, "α, weight of the KL in Eq. (5) (table)")
     beta1: float = flag(1.0, "β₁, weight of the action-free KL in Eq. (2) (table)")
     beta: float = flag(0.015, "β, weight of the disentanglement loss in Eq. (5) (table)")
     beta2: float = flag(0.015, "β₂, weight of the disentanglement loss in Eq. (2) (table)")
-    kl_balance: float = flag(0.8, "share of the KL that trains the prior (DreamerV2)")
+    kl_balance: float = flag(0.8, "share of the KL that trains the prior (DreamerV2)", high=1)
     free_nats: float = flag(1.0, "nats below which the KL is not trained (published)")
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
@@ -152,21 +155,32 @@ class Config:
     eta_delay: int = flag(-1, "decisions before it; -1: eta_decay across domains, else 0 "
                           "(published)", low=-1)
     # Behaviour, appendix B.
-    horizon: int = flag(15, "imagined transitions, H (table)", low=1)
+    horizon: int = flag(15, "imagined transitions, H (table)", low=1, high=1_000)
     imagine_starts: int = flag(0, "states of a batch to imagine from; 0: all (ours)")
-    gamma: float = flag(0.99, "discount γ (table)")
-    lambda_: float = flag(0.95, "λ of the λ-return (table)")
-    rho: float = flag(1.0, "ρ: 1 dynamics backprop, 0 REINFORCE (published)")
+    gamma: float = flag(0.99, "discount γ (table)", high=1)
+    lambda_: float = flag(0.95, "λ of the λ-return (table)", high=1)
+    rho: float = flag(1.0, "ρ: 1 dynamics backprop, 0 REINFORCE (published)", high=1)
     entropy_scale: float = flag(1e-4, "weight of the actor's entropy (published)")
-    actor_lr: float = flag(8e-5, "learning rate of the actor (table)")
-    critic_lr: float = flag(8e-5, "learning rate of the critic (table)")
+    actor_lr: float = flag(8e-5, "learning rate of the actor (table)", high=1)
+    critic_lr: float = flag(8e-5, "learning rate of the critic (table)", high=1)
     slow_every: int = flag(100, "updates between copies to the slow critic (published)", low=1)
     grad_clip: float = flag(100.0, "largest gradient norm of each optimiser (published)")
     # Machine.
     device: str = flag("auto", "where it runs (ours)", choices=("auto", "cpu", "cuda"), free=True)
     precision: str = flag("auto", "of convolutions and MLPs; auto: bf16 where native (ours)",
                           choices=("auto", "fp32", "bf16"), free=True)
-    threads: int = flag(0, "CPU threads; 0: one per core (ours)", free=True)
+    threads: int = flag(0, "CPU threads; 0: one per core (ours)", high=1024, free=True)
+
+    def __post_init__(self):
+        """Raises ValueError at wrong types and values out of range, also those of a checkpoint."""
+        for field in dataclasses.fields(self):
+            value, meta, kind = getattr(self, field.name), field.metadata, type(field.default)
+            good = type(value) is kind or (kind is float and type(value) is int)
+            if good and kind in (int, float):
+                good = meta["low"] <= value <= meta["high"]                   # which no NaN is
+            if not good or value not in (meta["choices"] or [value]):
+                want = meta["choices"] or f"{kind.__name__}, {meta['low']} to {meta['high']:,}"
+                raise ValueError(f"--{field.name.replace('_', '-').strip('-')} {value}: not {want}")
 
 PRESETS = {
     "paper": Config(),
@@ -646,9 +660,18 @@ def freeze(encoder):
     # DEVIATION: the published code switches the teacher's gradients back on and trains it along.
     return encoder.eval().requires_grad_(False)
 
-def adam(module, lr):
+class Adam(torch.optim.Adam):
     """The optimiser of a module's parameters (published)."""
-    return torch.optim.Adam(module.parameters(), lr=lr, eps=1e-5)
+
+    def __init__(self, module, lr):
+        super().__init__(module.parameters(), lr=lr, eps=1e-5)
+
+    def load_state_dict(self, state):
+        """The moments; the rest is the Config's. Torch itself would take another model's."""
+        super().load_state_dict(dict(state, param_groups=self.state_dict()["param_groups"]))
+        for p in self.param_groups[0]["params"] if self.state else ():
+            if [x.shape for x in self.state[p].values()] != [(), p.shape, p.shape]:
+                raise ValueError("the optimiser's moments are another model's")
 
 def autocast(cfg):
     """bf16 around convolutions and MLPs; statistics, GRU state, targets and losses are fp32."""
@@ -662,15 +685,14 @@ def to_device(batch, device):
 
 def gradient_step(optimizer, loss, metrics, clip):
     """Minimise loss over the optimiser's own parameters. Returns the gradient norm before clipping.
-    Raises UserError at a non-finite loss or gradient, before anything is changed."""
+    Raises FloatingPointError at a non-finite loss or gradient, before it changes anything."""
     parameters = optimizer.param_groups[0]["params"]
     optimizer.zero_grad()
     loss.backward(inputs=parameters)  # the actor's graph runs through the model, which gets none
     norm = nn.utils.clip_grad_norm_(parameters, clip)
     if not torch.isfinite(loss + norm):
         bad = [key for key, value in metrics.items() if not torch.isfinite(value).all()]
-        raise UserError(f"non-finite {', '.join(bad) or 'gradient'}; the last checkpoint is kept. "
-                        "Run again with --fresh and a smaller --model-lr, or with --precision fp32")
+        raise FloatingPointError(f"non-finite {', '.join(bad) or f'gradient, its norm is {norm}'}")
     optimizer.step()
     return norm
 
@@ -681,9 +703,9 @@ class Agent:
         self.cfg, self.action_dim, self.device, self.teacher = cfg, action_dim, device, teacher
         self.model = WorldModel(cfg, padded_actions(cfg, action_dim)).to(device)
         self.behaviour = ActorCritic(cfg, action_dim).to(device)
-        self.optimizers = dict(model=adam(self.model, cfg.model_lr),
-                               actor=adam(self.behaviour.actor, cfg.actor_lr),
-                               critic=adam(self.behaviour.critic, cfg.critic_lr))
+        self.optimizers = dict(model=Adam(self.model, cfg.model_lr),
+                               actor=Adam(self.behaviour.actor, cfg.actor_lr),
+                               critic=Adam(self.behaviour.critic, cfg.critic_lr))
 
     @torch.no_grad()
     def act(self, image, action, state, explore):
@@ -777,35 +799,47 @@ DAMAGED = (zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError,
            pickle.UnpicklingError, ValueError, TypeError, LookupError, EOFError, RuntimeError,
            OverflowError, SyntaxError, AttributeError)
 
-def npz_layout(path, keys):
-    """Where the arrays of an .npz lie in the file: {key: (offset, dtype, shape)}, bytes.
-    The offset of a compressed array is None. Raises UserError unless `keys` are plain arrays with
-    a row for each image, and images uint8 (T, 64, 64, 3)."""
-    layout = {}
+@contextlib.contextmanager
+def reading(path, kind="checkpoint of ours", remedy="restore it, or start over with --fresh"):
+    """What damaged or foreign content raises becomes one line that names the file."""
     try:
-        with zipfile.ZipFile(path) as archive, open(path, "rb") as file:
-            for info in archive.infolist():
-                with archive.open(info) as member:
-                    np.lib.format.read_magic(member)
-                    shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-                    header = member.tell()
-                if info.file_size != header + math.prod(shape) * dtype.itemsize:
-                    raise ValueError(f"{info.filename} is cut off, or no plain array")
-                file.seek(info.header_offset + 26)   # the local header, 30 bytes, ends in
-                header += 30 + int(np.frombuffer(file.read(4), "<u2").sum())  # two lengths
-                stored = info.compress_type == zipfile.ZIP_STORED
-                offset = info.header_offset + header if stored else None
-                layout[info.filename.removesuffix(".npy")] = offset, dtype, shape
-        length = len(range(layout["image"][2][0]))
-        if layout["image"][1:] != (np.dtype(np.uint8), (length, 64, 64, 3)):
-            raise ValueError("image is {1} {2}, not uint8 (T, 64, 64, 3)".format(*layout["image"]))
-        for key in keys:
-            if layout[key][1].hasobject or layout[key][2][:1] != (length,) or not length:
-                raise ValueError(f"{key} is {layout[key][1]} {layout[key][2]} for {length} images")
-    except KeyError as error:
-        raise UserError(f"{path} has no array {error}; it needs {', '.join(keys)}") from None
+        yield
     except DAMAGED as error:
-        raise UserError(f"{path} is not an episode ({error}); remove it and run again") from None
+        cause = f"{type(error).__name__}: {error}"[:120]
+        raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from None
+
+def npz_layout(path, keys, plain=True):
+    """Where the arrays of an .npz lie in the file: {key: (offset, dtype, shape)}, bytes.
+    The offset of an array that is compressed, or in Fortran's order, is None. Raises UserError
+    unless `keys` are arrays as make_row has them, a row for each image uint8 (64, 64, 3); `plain`:
+    and have an offset. Nothing is unpacked: a zip bomb is refused by the size that it declares."""
+    layout = {}
+    with (reading(path, f"episode with {', '.join(keys)}", "remove it and run again"),
+          zipfile.ZipFile(path) as archive, open(path, "rb") as file):
+        for info in archive.infolist():
+            if info.file_size > max(2**30, 100 * info.compress_size):
+                raise ValueError(f"{info.filename} would unpack to {info.file_size:,} bytes")
+            with archive.open(info) as member:
+                np.lib.format.read_magic(member)
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
+                header = member.tell()
+            file.seek(info.header_offset + 26)       # the local header, 30 bytes, ends in
+            start = info.header_offset + 30 + int(np.frombuffer(file.read(4), "<u2").sum())
+            mapped = info.compress_type == zipfile.ZIP_STORED and not fortran  # two lengths
+            end = start + (info.file_size if mapped else info.compress_size)
+            if (info.file_size != header + math.prod(shape) * dtype.itemsize
+                    or end > os.fstat(file.fileno()).st_size):
+                raise ValueError(f"{info.filename} is cut off, or no plain array")
+            name = info.filename.removesuffix(".npy")
+            layout[name] = start + header if mapped else None, dtype, shape
+        length = len(range(layout["image"][2][0]))
+        for key in keys:
+            offset, dtype, shape = layout[key]
+            row = dict(image=(64, 64, 3), action=shape[1:2]).get(key, ())
+            if dtype != ROW[key] or shape != (length, *row) or not length:
+                raise ValueError(f"{key} is {dtype} {shape}, not {np.dtype(ROW[key])} (T, *{row})")
+            if plain and offset is None:
+                raise ValueError(f"{key} is compressed, which only --videos may be")
     return layout
 
 class Replay:
@@ -824,7 +858,7 @@ class Replay:
         self._hold([(path, npz_layout(path, keys)) for path in sorted(self.folder.glob("*.npz"))])
         self.capacity = capacity
         last = self.paths[-1].stem if self.paths else ""
-        self.next_index = int(last) + 1 if last.isdigit() else 0
+        self.next_index = int(last) + 1 if last.isdecimal() else 0
 
     def _hold(self, episodes):
         """Index (path, layout) pairs, less the oldest beyond capacity."""
@@ -855,10 +889,10 @@ class Replay:
 
     def load_state_dict(self, state):
         """Return to those episodes; later ones, of a run cut off, go."""
-        first, self.next_index = state["first"], state["next"]
-        numbers = {f"{number:06d}" for number in range(first, self.next_index)}
-        self._hold([episode for episode in self.episodes if episode[0].stem in numbers])
-        if len(self.paths) != self.next_index - first:
+        numbers, self.next_index = range(state["first"], state["next"]), state["next"]
+        self._hold([(path, layout) for path, layout in self.episodes
+                    if path.stem.isdecimal() and int(path.stem) in numbers])
+        if len(self.paths) != len(numbers):
             raise UserError(f"{self.folder} lacks episodes of its checkpoint; start over: --fresh")
         self.prune()
 
@@ -887,7 +921,8 @@ class Replay:
 def open_videos(folder, cache):
     """The .npz episodes of a folder as a Replay of images.
     Foreign ones (the authors' are compressed and lack is_first) are unpacked into `cache`, once."""
-    layouts = {path: npz_layout(path, ("image",)) for path in sorted(Path(folder).glob("*.npz"))}
+    paths = sorted(Path(folder).glob("*.npz"))
+    layouts = {path: npz_layout(path, ("image",), plain=False) for path in paths}
     if not layouts:
         raise UserError(f"no episodes (*.npz) in {folder}; run: python diswm.py collect --src TASK")
     if all("is_first" in layout and layout["image"][0] for layout in layouts.values()):
@@ -895,11 +930,9 @@ def open_videos(folder, cache):
     cache.mkdir(parents=True, exist_ok=True)
     for path in layouts:
         if not (cache / path.name).exists():
-            try:
-                with np.load(path, allow_pickle=False) as episode:
-                    image = episode["image"]
-            except DAMAGED as error:
-                raise UserError(f"{path} is damaged ({error}); remove it and run again") from None
+            with (reading(path, "whole episode", "remove it and run again"),
+                  np.load(path, allow_pickle=False) as episode):
+                image = episode["image"]
             with atomic(cache / path.name) as file:
                 np.savez(file, image=image, is_first=np.arange(len(image)) == 0)
     return Replay(cache, keys=VIDEO_KEYS)
@@ -1244,18 +1277,23 @@ def run_folder(cfg, stage):
     return Path(cfg.runs) / stage / tasks.replace("/", "_") / cfg.method / f"seed{cfg.seed}"
 
 def read_checkpoint(path):
-    """A checkpoint, loaded without executing code. UserError when it is missing or not ours."""
-    try:
+    """A checkpoint, loaded without executing code. UserError when it is missing or not ours.
+    No path that stands in it is ever followed."""
+    if not Path(path).exists():
+        raise UserError(f"there is no checkpoint {path}; train that run first, for instance: "
+                        "python diswm.py finetune --dst walker_walk")
+    with reading(path), zipfile.ZipFile(path) as archive:
+        # torch.load would unpack a bomb, and looks at no checksum.
+        packed = sum(info.file_size for info in archive.infolist()) > os.path.getsize(path)
+        if packed or archive.testzip():
+            raise ValueError("compressed, or altered")
         state = torch.load(path, map_location="cpu", weights_only=True)
         state["config"] = Config(**state["config"])
+        tensors = [x for x in tree_leaves(state["trainer"]) if isinstance(x, torch.Tensor)]
+        if not all(x.dtype in (torch.float32, torch.int64) and x.isfinite().all() for x in tensors):
+            raise ValueError("not all weights are finite float32")
+        int(state["trainer"]["progress"])
         return dict(state) | {key: state[key] for key in ("stage", "trainer", "rng", "log_bytes")}
-    except FileNotFoundError:
-        raise UserError(f"there is no checkpoint {path}; train that run first, for instance: "
-                        "python diswm.py finetune --dst walker_walk") from None
-    except (*DAMAGED, OSError) as error:
-        reason = (str(error).splitlines() or [""])[0][:80]
-        raise UserError(f"{path} is not a checkpoint of ours ({type(error).__name__}: {reason}); "
-                        "restore it, or start over with --fresh") from None
 
 class Run:
     """A run's folder: checkpoint.pt, config.json, metrics.jsonl, TensorBoard events."""
@@ -1267,8 +1305,14 @@ class Run:
         self.cfg, self.stage, self.folder = cfg, stage, run_folder(cfg, stage)
         self.checkpoint = self.folder / "checkpoint.pt"
         self.log_path = self.folder / "metrics.jsonl"
-        if fresh:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.lock = open(self.folder / "lock", "w")  # noqa: SIM115, train() closes it
+        try:
+            fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # a process that dies lets go
+        except BlockingIOError:
+            raise UserError(f"another process is at work in {self.folder}; stop it first") from None
+        for path in set(self.folder.iterdir()) - {self.folder / "lock"} if fresh else ():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
         self.state = read_checkpoint(self.checkpoint) if self.checkpoint.exists() else None
         old = self.state["config"] if self.state else cfg
         differ = [f"{field.name} {getattr(old, field.name)} (now {getattr(cfg, field.name)})"
@@ -1280,25 +1324,44 @@ class Run:
 
     def save(self, trainer):
         """Write the checkpoint, whole or not at all."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         config, cpu = dataclasses.asdict(self.cfg), torch.get_rng_state()
         cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
         log_bytes = self.log_path.stat().st_size if self.log_path.exists() else 0
         buffer = io.BytesIO()  # a full disk is then an OSError of the file, not one inside torch
         torch.save(dict(config=config, stage=self.stage, trainer=trainer.state_dict(),
                         rng=dict(cpu=cpu, cuda=cuda), log_bytes=log_bytes), buffer)
+        with atomic(self.folder / "config.json") as file:
+            file.write(json.dumps(config, indent=2).encode())
         with atomic(self.checkpoint) as file:
             file.write(buffer.getbuffer())
-        (self.folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
 
     def restore(self, trainer):
         """Trainer, random numbers, and the log as it was then."""
-        trainer.load_state_dict(self.state["trainer"])
-        torch.set_rng_state(self.state["rng"]["cpu"])
-        if self.state["rng"]["cuda"] is not None and self.cfg.device == "cuda":
-            torch.cuda.set_rng_state(self.state["rng"]["cuda"])
-        if self.log_path.exists():
-            os.truncate(self.log_path, self.state["log_bytes"])              # the rest comes again
+        with reading(self.checkpoint):
+            trainer.load_state_dict(self.state["trainer"])
+            torch.set_rng_state(self.state["rng"]["cpu"])
+            if self.state["rng"]["cuda"] is not None and self.cfg.device == "cuda":
+                torch.cuda.set_rng_state(self.state["rng"]["cuda"])
+            if self.log_path.exists():
+                if not 0 <= self.state["log_bytes"] <= self.log_path.stat().st_size:
+                    raise ValueError(f"{self.log_path.name} is shorter than it was then")
+                os.truncate(self.log_path, self.state["log_bytes"])          # the rest comes again
+
+@contextlib.contextmanager
+def stop_requests():
+    """Yield a list that gets the first SIGTERM or Ctrl-C; a second one exits at once."""
+    received = []
+
+    def note(number, frame):
+        received.append(number)
+        if len(received) > 1:
+            raise SystemExit(128 + number)
+        os.write(2, b"finishing this episode or update, then saving; again to stop now\n")
+    with contextlib.ExitStack() as handlers:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            with contextlib.suppress(ValueError):             # a thread may not have handlers
+                handlers.callback(signal.signal, number, signal.signal(number, note))
+        yield received
 
 def train(trainer, run):
     """The one training loop: resume; then work, log, checkpoint, until the Trainer's total."""
@@ -1310,25 +1373,37 @@ def train(trainer, run):
         run.save(trainer)
     began, first = time.time(), trainer.progress
     bar = tqdm(total=trainer.total, initial=first, unit=f" {trainer.unit}", disable=None)
-    with contextlib.closing(SummaryWriter(run.folder, purge_step=first + 1)) as writer, bar:
-        while trainer.progress < trainer.total:
-            row = trainer.advance()
-            seconds = time.time() - began
-            row |= dict(seconds=seconds, rate=(trainer.progress - first) / seconds)
-            with open(run.log_path, "a") as file:
-                file.write(json.dumps(row) + "\n")
-            for key, value in row.items():
-                if isinstance(value, (int, float)):
-                    writer.add_scalar(key, value, trainer.progress)
-            run.save(trainer)
-            trainer.saved()
-            shown = "  ".join(f"{key} {row[key]:.4g}" for key in trainer.shown if key in row)
-            bar.set_postfix_str(shown, refresh=False)
+    with (run.lock, stop_requests() as stop, bar, contextlib.closing(
+            SummaryWriter(run.folder, purge_step=first + 1)) as writer):
+        while trainer.progress < trainer.total and not stop:
+            try:
+                row = trainer.advance()
+            except FloatingPointError as error:
+                np.savez(batch := run.folder / "nonfinite.npz", **trainer.batch)
+                raise UserError(f"{error}, from {batch}; the last checkpoint is kept. Try --fresh "
+                                "with a smaller --model-lr, or --precision fp32") from None
             bar.update(trainer.progress - bar.n)
-            if bar.disable:                                                   # not a terminal
+            if row:
+                seconds = time.time() - began
+                row |= dict(seconds=seconds, rate=(trainer.progress - first) / seconds)
+                with open(run.log_path, "a") as file:
+                    file.write(json.dumps(row) + "\n")
+                    file.flush()
+                    os.fsync(file)                       # before the checkpoint that counts on it
+                for key, value in row.items():
+                    if isinstance(value, (int, float)):
+                        writer.add_scalar(key, value, trainer.progress)
+                shown = "  ".join(f"{key} {row[key]:.4g}" for key in trainer.shown if key in row)
+                bar.set_postfix_str(shown, refresh=False)
+            if row or stop:
+                run.save(trainer)
+            if row and bar.disable:                                           # not a terminal
                 left = tqdm.format_interval((trainer.total - trainer.progress) / row["rate"])
                 print(f"{trainer.progress:,}/{trainer.total:,} {trainer.unit}  {shown}  "
                       f"{row['rate']:.1f} {trainer.unit}/s  ETA {left}", flush=True)
+    if stop and trainer.progress < trainer.total:
+        raise UserError(f"stopped by {signal.Signals(stop[0]).name}, saved at {trainer.progress:,} "
+                        f"{trainer.unit}; the same command goes on from there", 128 + stop[0])
     print(f"done: {run.folder}")
 
 def mean_metrics(rows):
@@ -1338,12 +1413,9 @@ def mean_metrics(rows):
             for name in names}
 
 class Trainer:
-    """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics.
-    What changes: `parts` that have a state_dict, and `counters`."""
+    """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics or
+    None. What changes: `parts` that have a state_dict, and `counters`; `batch`: the latest."""
     counters = ("progress",)
-
-    def saved(self):
-        """A checkpoint was written."""
 
     def state_dict(self):
         parts = {name: getattr(self, name).state_dict() for name in self.parts}
@@ -1353,18 +1425,20 @@ class Trainer:
         for name in self.parts:
             getattr(self, name).load_state_dict(state[name])
         for name in self.counters:
+            if type(state[name]) is not type(getattr(self, name)):
+                raise TypeError(f"{name} is {state[name]}")
             setattr(self, name, state[name])
 
 class VideoTrainer(Trainer):
     """Stage 2, Algorithm 1 lines 4–8: the video predictor. Progress is in updates."""
     unit, shown, parts = "updates", ("image", "kl", "disentangle"), ("model", "optimizer")
-    chunk = 100                                                               # updates per log row
+    counters, chunk = ("progress", "metrics"), 100                            # updates per log row
 
     def __init__(self, cfg, videos, device):
         self.cfg, self.videos, self.device = cfg, videos, device
         self.model = VideoPredictor(cfg).to(device)
-        self.optimizer = adam(self.model, cfg.model_lr)
-        self.progress, self.total = 0, cfg.pretrain_updates
+        self.optimizer = Adam(self.model, cfg.model_lr)
+        self.progress, self.metrics, self.total = 0, [], cfg.pretrain_updates
 
     def update(self, batch):
         """One step of Eq. (2) on numpy arrays (B, T, ...) → metrics."""
@@ -1375,17 +1449,15 @@ class VideoTrainer(Trainer):
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
 
     def advance(self):
-        """Some updates → a row of the log."""
-        metrics, cfg = [], self.cfg
-        for _ in range(min(self.chunk, self.total - self.progress)):
-            rng = np.random.default_rng([cfg.seed, self.progress])            # nothing to save
-            batch = self.videos.sample(cfg.batch_size, cfg.batch_length, rng)
-            metrics.append(self.update(batch))
-            self.progress += 1
-        return dict(update=self.progress) | mean_metrics(metrics)
-
-    def state_dict(self):
-        return super().state_dict() | dict(videos=str(self.videos.folder))
+        """An update → after every `chunk` of them, and at the end, a row of the log."""
+        cfg, rng = self.cfg, np.random.default_rng([self.cfg.seed, self.progress])  # not saved
+        self.batch = self.videos.sample(cfg.batch_size, cfg.batch_length, rng)
+        self.metrics.append(self.update(self.batch))
+        self.progress += 1
+        if self.progress % self.chunk and self.progress < self.total:
+            return None
+        row, self.metrics = dict(update=self.progress) | mean_metrics(self.metrics), []
+        return row
 
 class AgentTrainer(Trainer):
     """Stages 1 and 3, Algorithm 1 lines 9–25: an agent in an environment. Progress in env steps.
@@ -1422,8 +1494,9 @@ class AgentTrainer(Trainer):
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
         for _ in range(self.updates_due(decisions)):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
-            batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
-            metrics.append(self.agent.update(batch, eta, self.updates, self.updates % 100 == 0))
+            self.batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
+            probe = self.updates % 100 == 0
+            metrics.append(self.agent.update(self.batch, eta, self.updates, probe))
             self.updates += 1
         return metrics
 
@@ -1446,6 +1519,7 @@ class AgentTrainer(Trainer):
     def advance(self):
         """An episode in each environment, and an evaluation when one is due → a row of the log."""
         cfg, phase, before = self.cfg, self.phase, self.progress
+        self.replay.prune()           # a checkpoint was written: what only the one before needed
         episodes, metrics = self.play()
         self.episodes += len(episodes)
         rows, returns, success = zip(*episodes, strict=True)
@@ -1463,10 +1537,6 @@ class AgentTrainer(Trainer):
             row["eval_return"] = result.pop("mean")
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
-
-    def saved(self):
-        """A checkpoint was written: episodes that only the one before needed can go."""
-        self.replay.prune()
 
     def state_dict(self):
         """And the teacher, so that the run needs no other file."""
@@ -1500,6 +1570,10 @@ def announce(cfg, stage, folder, frames):
     """What runs, on what, its needs and folder."""
     disk = 0.1 + frames * 12.35e-6                                            # GB; a row is 12.3 kB
     memory = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5  # measured
+    have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    if cfg.device == "cpu" and memory > have:
+        raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
+                        "take a smaller --batch-size, --batch-length or --cnn-depth")
     print(f"{stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
           f"{cfg.precision} and {torch.get_num_threads()} threads\n  needs about {disk:.1f} GB of "
           f"disk and {memory:.1f} GB of memory; results go to {folder}", flush=True)
@@ -1565,7 +1639,7 @@ def find_teacher(cfg, device):
         raise UserError(f"no teacher in {own.parent}; {command}"
                         + (f" (or take one that exists: --src {min(others)})" if others else ""))
     state = read_checkpoint(path)
-    saved, done = state["config"], state["trainer"].get("progress")
+    saved, done = state["config"], state["trainer"]["progress"]
     if state["stage"] != "pretrain" or saved.encoder != ("beta_vae" if cfg.eta else cfg.encoder):
         raise UserError(f"{path} is a {saved.encoder} {state['stage']} run, no teacher; {command}")
     if saved.src == cfg.dst:
@@ -1577,8 +1651,9 @@ def find_teacher(cfg, device):
     if done < saved.pretrain_updates:
         raise UserError(f"{path} is not finished ({done} of {saved.pretrain_updates}); {command}")
     print(f"teacher: {path} ({saved.src}, {done:,} updates)")
-    model = VideoPredictor(saved)
-    model.load_state_dict(state["trainer"]["model"])
+    with reading(path):
+        model = VideoPredictor(saved)
+        model.load_state_dict(state["trainer"]["model"])
     return model.to(device)
 
 def saved_teacher(trainer, cfg, device):
@@ -1593,12 +1668,13 @@ def load_model(folder, device):
     """A run's model from its checkpoint → (cfg, Agent or VideoPredictor, the trainer's state)."""
     state = read_checkpoint(Path(folder) / "checkpoint.pt")
     cfg, trainer = replace(state["config"], device=device.type, precision="fp32"), state["trainer"]
-    if state["stage"] == "pretrain":
-        model, weights = VideoPredictor(cfg).to(device), trainer["model"]
-    else:
-        model = Agent(cfg, trainer["action_dim"], device, saved_teacher(trainer, cfg, device))
-        weights = trainer["agent"]
-    model.load_state_dict(weights)
+    with reading(Path(folder) / "checkpoint.pt"):
+        if state["stage"] == "pretrain":
+            model, weights = VideoPredictor(cfg).to(device), trainer["model"]
+        else:
+            model = Agent(cfg, trainer["action_dim"], device, saved_teacher(trainer, cfg, device))
+            weights = trainer["agent"]
+        model.load_state_dict(weights)
     return cfg, model, trainer
 
 def evaluate(folder, device, episodes=None):
@@ -1679,15 +1755,19 @@ def draw_grid(pictures, rows, columns, path, title=""):
     axes.figure.savefig(path, dpi=100, bbox_inches="tight")
     print(f"wrote {path}")
 
-def traverse(folder, device):
-    """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder."""
+def traverse(folder, device, videos=""):
+    """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder.
+    Episodes: `videos`, else the run's, else those collected beside it: none that a checkpoint,
+    which may be a stranger's, could name."""
     folder = Path(folder)
-    cfg, model, trainer = load_model(folder, device)
-    online = isinstance(model, Agent)
-    replay = Replay(folder / "episodes") if online else Replay(trainer["videos"], keys=VIDEO_KEYS)
+    cfg, model, _ = load_model(folder, device)
+    online, collected = isinstance(model, Agent), f"collect/{cfg.src}/*/seed*/episodes"
+    places = [folder / "videos", *(folder / "../../../..").glob(collected)]
+    place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
+    replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
     model = model.model if online else model
     if not replay.rows:
-        raise UserError(f"the episodes of {folder} are gone; nothing to draw from")
+        raise UserError(f"no episodes in {replay.folder}; nothing to draw from (see --videos)")
     # From the middle of the last episode: the colours of the end, and a pose that is not the start.
     start = ([0, *replay.ends][-2] + replay.rows) // 2
     window = replay.window(start, min(50, replay.rows - start))
@@ -1706,12 +1786,17 @@ def traverse(folder, device):
                       ["recon.", *TRAVERSAL], folder / "traversal.png")
 
 def read_log(folder):
-    """A run's metrics.jsonl → list of dicts; empty when there is none."""
+    """A run's metrics.jsonl → list of dicts; empty when there is none.
+    A last line without its end is left out: it is being written, or was cut off."""
     path = Path(folder) / "metrics.jsonl"
-    try:
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    except ValueError as error:
-        raise UserError(f"{path} is not a log of ours ({error}); remove it") from None
+    with reading(path, "log of ours", "remove it"):
+        lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+        rows = [json.loads(line) for line in lines]
+        for row in rows:
+            step = row["step" if type(row.get("phase")) is str else "update"]
+            if not math.isfinite(step + row.get("eval_return", 0)):
+                raise ValueError(f"step {step}")
+    return rows
 
 def plot(folders, path):
     """Evaluation returns of runs …/<tasks>/<method>/seed<k>: mean and spread over seeds."""
@@ -1826,17 +1911,7 @@ class Parser(argparse.ArgumentParser):
     def error(self, message):
         flags = " ".join(a.option_strings[0] for a in self._actions[1:] if a.option_strings)
         hint = f"there are: {flags}" if "unrecognized" in message else f"see: {self.prog} --help"
-        self.exit(2, f"error: {message}; {hint}\n")
-
-def number(kind, low):
-    """A parser of numbers of a type that are finite and at least `low`."""
-
-    def parse(text):
-        if not low <= kind(text) < math.inf:
-            raise argparse.ArgumentTypeError(f"{text} is not a number from {low} up")
-        return kind(text)
-    parse.__name__ = kind.__name__
-    return parse
+        self.exit(2, " ".join(f"error: {message}; {hint}".split()) + "\n")
 
 def add_config_flags(parser):
     """A flag for every field of Config; only those given end up in the namespace."""
@@ -1844,8 +1919,7 @@ def add_config_flags(parser):
         meta, kind = field.metadata, type(field.default)
         choices = METHODS if field.name == "method" else meta["choices"]
         options = dict(action=argparse.BooleanOptionalAction) if kind is bool else dict(
-            choices=choices, type=number(kind, meta["low"]) if kind in (int, float) else kind,
-            metavar=None if choices else kind.__name__.upper())
+            choices=choices, type=kind, metavar=None if choices else kind.__name__.upper())
         parser.add_argument("--" + field.name.strip("_").replace("_", "-"), dest=field.name,
                             default=argparse.SUPPRESS, **options,
                             help=f"{meta['help']}; paper preset: {field.default or 'none'}")
@@ -1869,7 +1943,10 @@ def parse_args(argv):
         commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
     given = {key: value for key, value in vars(args).items() if key in Config.__dataclass_fields__}
     preset = args.preset or ("paper" if torch.cuda.is_available() else "small")
-    cfg = replace(PRESETS[preset], **METHODS[given.get("method", "diswm")] | given)
+    try:
+        cfg = replace(PRESETS[preset], **METHODS[given.get("method", "diswm")] | given)
+    except ValueError as error:
+        commands.choices[args.command].error(str(error))
     if not args.preset and args.command in ("collect", "pretrain", "finetune"):
         print(f"preset {preset}; --preset chooses another: {', '.join(PRESETS)}")
     for task in (cfg.src, cfg.dst):
@@ -1898,8 +1975,10 @@ def run_command(argv):
     cfg, command = prepare_machine(cfg), globals()[args.command]
     if command in (collect, pretrain, finetune):
         command(cfg, args.fresh)
-    elif command in (evaluate, traverse):
-        command(args.run, torch.device(cfg.device))
+    elif command is evaluate:
+        evaluate(args.run, torch.device(cfg.device))
+    elif command is traverse:
+        traverse(args.run, torch.device(cfg.device), cfg.videos)
     elif command is plot:
         runs = Path(cfg.runs)
         plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")
@@ -1910,19 +1989,22 @@ def main(argv=None):
     """Run a command. A user's mistake is one line and exit code 1 or 2. Returns the exit code."""
     try:
         run_command(argv)
+        return 0
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.code
+        message, code = str(error), error.code
     except OSError as error:
-        print(f"error: {error.filename or 'output'}: {error.strerror or error}; mend that and run "
-              "the same command again, the last checkpoint is whole", file=sys.stderr)
-        return 1
+        message, code = (f"{error.filename or 'output'}: {error.strerror or error}; mend that and "
+                         "run the same command again, the last checkpoint is whole"), 1
+    except (MemoryError, RuntimeError) as error:
+        if not re.search("(?i)alloc|memory|overflow", repr(error)):
+            raise
+        message, code = f"too large for the memory: {error}"[:200], 1
     except KeyboardInterrupt:
-        print("\nerror: interrupted; the same command goes on from the last checkpoint",
-              file=sys.stderr)
-        return 130
-    return 0
+        message, code = "interrupted; the same command goes on from the last checkpoint", 130
+    print("error:", " ".join(message.split()), file=sys.stderr)
+    return code
 
 if __name__ == "__main__":
     from diswm import main  # so that the processes of --envs find everything by its name
+    sys.stdout.reconfigure(errors="backslashreplace")  # a Latin-1 terminal has no β
     sys.exit(main())

@@ -9,17 +9,18 @@ production code through the module.
 import contextlib
 import copy
 import dataclasses
-import errno
 import functools
 import io
 import json
 import os
+import resource
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -40,6 +41,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from torch.distributions import Categorical, Normal, kl_divergence
+from torch.utils import tensorboard
 
 import diswm
 from diswm import METHODS, PRESETS, TASKS, AgentTrainer, Replay, UserError, make_env, make_row
@@ -2226,6 +2228,10 @@ def cut(patch, owner, name, call):
     return count
 
 
+COLLECTED = "collect/cheetah_run/dreamerv2/seed0"
+PRETRAINED = "pretrain/cheetah_run/diswm/seed0"
+FINETUNED = "finetune/cheetah_run-walker_walk/diswm/seed0"
+
 # The switch, at 130, falls into an episode; so does no evaluation: they follow episodes 3 and 6.
 CUT_FLAGS = (*DEBUG, "--steps", 260, "--eval-every", 120, "--slow-every", 4)
 
@@ -2343,71 +2349,288 @@ def test_pretraining_sees_the_same_videos_whatever_the_chunk_of_its_log(
     assert_identical(*weights)
 
 
-@pytest.mark.parametrize("name", ["fsync", "replace"])
-def test_full_disk_during_a_save_leaves_the_old_checkpoint_valid(name, teacher, uncut, tmp_path):
-    """A checkpoint is written whole or not at all; a full disk is one line, and the run goes on."""
-    argv = cut_command(teacher, tmp_path)
-    interrupt(diswm.ActionRepeat, "step", 40, argv)
-    checkpoint = next(tmp_path.rglob("checkpoint.pt"))
-    before, real, target = checkpoint.read_bytes(), getattr(os, name), []
+def start(argv):
+    """A real process of a command line, whose output nobody reads."""
+    return subprocess.Popen([sys.executable, diswm.__file__, *map(str, argv)],
+                            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
-    def full(*args):
-        target.append(args)
-        if len(target) == 2:  # the first is the episode's file, the second the checkpoint's
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(*args)
+
+def kill_at(argv, run, moment, skip):
+    """SIGKILL a real process in the (skip + 1)-th write of a "checkpoint" or "episode", or so many
+    seconds after its run folder is locked. Returns what was written at its death: a file that the
+    process left half done or had not yet put in its place, "between", or "finished"."""
+    process, begin = start(argv), None
+    names = dict(checkpoint=run, episode=run / "episodes")
+    seen, inside = -1, False
+    while process.poll() is None:
+        if moment in names:
+            with contextlib.suppress(FileNotFoundError):
+                found = any(name.endswith(".tmp") and name != "config.json.tmp"
+                            for name in os.listdir(names[moment]))
+                seen, inside = seen + (found and not inside), found
+            if seen == skip:
+                break
+        elif (run / "lock").exists():
+            begin = begin or time.time()
+            if time.time() > begin + moment:
+                break
+            time.sleep(0.001)
+    process.kill()
+    _, err = process.communicate()
+    assert process.returncode in (0, -signal.SIGKILL), err
+    left = [f"{path.name} {path.stat().st_size} bytes" for path in run.rglob("*.tmp")]
+    return " ".join(left) or ("between" if process.returncode else "finished")
+
+
+def kill_loop(argv, run, whole, moments, log):
+    """Kill at each of the moments, resuming with the same command; then let it finish.
+    Wherever a run got finished before its moment, it is compared, and begun again."""
+    for moment, skip in moments:
+        where = kill_at(argv, run, moment, skip)
+        log.append(f"{argv[0]}, at {moment}: {where}")
+        if where == "finished":
+            assert_identical(everything(run), whole)
+            shutil.rmtree(run)
+    succeed(*argv)
+    assert_identical(everything(run), whole)
+    assert not list(run.rglob("*.tmp"))
+
+
+def test_killed_process_resumes_bit_for_bit(tmp_path):
+    """The short form of the kill loop: once in an episode's write, once in a checkpoint's."""
+    log, argv = [], ("collect", *DEBUG, "--collect-steps", 150, "--runs")
+    whole, run = (tmp_path / runs / COLLECTED for runs in ("whole", "killed"))
+    succeed(*argv, tmp_path / "whole")
+    kill_loop((*argv, tmp_path / "killed"), run, everything(whole),
+              [("episode", 1), ("checkpoint", 1)], log)
+    assert "npz.tmp" in log[0] or "pt.tmp" in log[1], log
+
+
+@slow
+def test_twenty_kills_of_collect_pretrain_and_finetune_change_nothing(teacher, root, tmp_path):
+    """Issue 5: at least three in a checkpoint's write, three in an episode's, the others anywhere;
+    weights, moments, replay, log equal those of the uninterrupted runs. pytest -rP shows where."""
+    rng, log = np.random.default_rng(0), []
+    videos = next((root / "runs/collect").rglob("episodes"))
+    stages = {
+        COLLECTED: ("collect", *DEBUG, "--collect-steps", 400),
+        PRETRAINED: (
+            "pretrain", *DEBUG, "--videos", videos, "--pretrain-updates", 350),
+        FINETUNED: ("finetune", *DEBUG, "--teacher", teacher, "--steps", 400)}
+    for folder, argv in stages.items():
+        succeed(*argv, "--runs", tmp_path / "whole")
+        whole = everything(tmp_path / "whole" / folder)
+        moments = [("checkpoint", 1), ("checkpoint", 0), ("checkpoint", 2)]
+        if argv[0] != "pretrain":
+            moments += [("episode", 1), ("episode", 0), ("episode", 2)]
+        moments += [(float(seconds), 0) for seconds in rng.uniform(0, 4, 9 - len(moments))]
+        argv = (*argv, "--runs", tmp_path / "killed")
+        kill_loop(argv, tmp_path / "killed" / folder, whole, rng.permutation(
+            np.array(moments, object)).tolist(), log)
+    print(*log, sep="\n")
+    (tmp_path / "kills.log").write_text("\n".join(log))
+    assert sum("finished" not in line for line in log) >= 20
+    assert sum("pt.tmp" in line for line in log) >= 3
+    assert sum("npz.tmp" in line for line in log) >= 3
+
+
+def send(patch, owner, name, call, *numbers):
+    """Send this process signals at the `call`-th call of owner.name."""
+    original, count = getattr(owner, name), [0]
+
+    @functools.wraps(original)
+    def wrapper(*args, **kwargs):
+        count[0] += 1
+        for number in numbers if count[0] == call else ():
+            signal.raise_signal(number)
+        return original(*args, **kwargs)
+    patch.setattr(owner, name, wrapper)
+
+
+def test_signal_finishes_the_episode_saves_and_says_so(
+        teacher, uncut, tmp_path, monkeypatch, capfd):
+    """The run continues as if nothing had been; the handlers of before are there again."""
+    argv = cut_command(teacher, tmp_path)
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        send(patch, diswm.ActionRepeat, "step", 40, signal.SIGTERM)
+        refuse(*argv, code=143, says=("saved at 100 env steps", "the same command"))
+    assert "finishing" in capfd.readouterr().err
+    assert before == (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT))
+    assert diswm.read_checkpoint(tmp_path / FINETUNED / "checkpoint.pt")["trainer"]["episodes"] == 2
+    succeed(*argv)
+    assert_identical(everything(tmp_path / FINETUNED), uncut)
+
+
+def pretrain_command(root, runs, updates=12):
+    """Pretraining from the videos that are there; a checkpoint every 5 updates in `brief`."""
+    return ("pretrain", "--videos", root / "runs" / COLLECTED / "episodes", *DEBUG,
+            "--pretrain-updates", updates, "--runs", runs)
+
+
+@pytest.fixture
+def brief(root, tmp_path, monkeypatch):
+    """What an uninterrupted pretraining of 12 updates leaves behind, a row for each 5."""
+    monkeypatch.setattr(diswm.VideoTrainer, "chunk", 5)
+    succeed(*pretrain_command(root, tmp_path / "whole"))
+    return everything(tmp_path / "whole" / PRETRAINED)
+
+
+@pytest.mark.parametrize("numbers, code, saved", [
+    ((signal.SIGTERM,), 143, 8), ((signal.SIGINT,), 130, 8),
+    ((signal.SIGTERM, signal.SIGINT), 130, 5), ((signal.SIGINT, signal.SIGTERM), 143, 5)])
+def test_one_signal_saves_after_this_update_and_a_second_stops_at_once(
+        numbers, code, saved, root, brief, tmp_path, monkeypatch):
+    """In the middle of a row of the log, whose mean then has the updates before the signal too."""
+    argv = pretrain_command(root, tmp_path)
+    with monkeypatch.context() as patch:
+        send(patch, diswm.VideoTrainer, "update", 8, *numbers)
+        assert run_cli(*argv)[0] == code
+    state = diswm.read_checkpoint(tmp_path / PRETRAINED / "checkpoint.pt")
+    assert state["trainer"]["progress"] == saved
+    succeed(*argv)
+    assert_identical(everything(tmp_path / PRETRAINED), brief)
+
+
+@slow
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signal_stops_a_real_process(number, code, teacher, uncut, tmp_path):
+    """As `kill` and a terminal send them: two lines, no traceback."""
+    argv = cut_command(teacher, tmp_path)
+    process = start(argv)
+    while not (tmp_path / FINETUNED / "metrics.jsonl").exists():
+        time.sleep(0.01)
+    process.send_signal(number)
+    _, err = process.communicate()
+    assert process.returncode == code
+    assert [line.split()[0] for line in err.splitlines()] == ["finishing", "error:"]
+    succeed(*argv)
+    assert_identical(everything(tmp_path / FINETUNED), uncut)
+
+
+def test_training_runs_in_a_thread_that_may_not_handle_signals(root, tmp_path):
+    """As a library: only a main thread may set handlers."""
+    argv = ("pretrain", "--videos", next((root / "runs/collect").rglob("episodes")), *DEBUG,
+            "--pretrain-updates", 2, "--runs", tmp_path)
+    codes = []
+    thread = threading.Thread(target=lambda: codes.append(diswm.main(list(map(str, argv)))))
+    thread.start()
+    thread.join()
+    assert codes == [0]
+
+
+def test_second_process_on_a_run_is_refused_also_with_fresh(root, tmp_path):
+    """Two writers would mix their logs and episodes. A process that dies frees the folder."""
+    argv, run = pretrain_command(root, tmp_path, 10**6), tmp_path / PRETRAINED
+    process = start(argv)
+    while not (run / "checkpoint.pt").exists():
+        time.sleep(0.01)
+    for extra in (), ("--fresh",):
+        refuse(*argv, *extra, says=("another process", str(run)))
+    assert (run / "checkpoint.pt").exists()
+    process.kill()
+    process.communicate()
+    succeed(*pretrain_command(root, tmp_path, 2), "--fresh")
+    assert [row["update"] for row in read_rows(run)] == [2]
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A real file system of 8 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", folder],
+                          capture_output=True)
+    if made.returncode:
+        pytest.skip("mount is not permitted")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def fill(folder):
+    """Leave no byte free."""
+    with contextlib.suppress(OSError), open(folder / "filler", "wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+
+
+@contextlib.contextmanager
+def before_call(owner, name, call, action):
+    """Do something just before the `call`-th call of owner.name."""
+    original, count = getattr(owner, name), [0]
+
+    @functools.wraps(original)
+    def wrapper(*args, **kwargs):
+        count[0] += 1
+        if count[0] == call:
+            action()
+        return original(*args, **kwargs)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, name, full)
+        patch.setattr(owner, name, wrapper)
+        yield
+    assert count[0] >= call
+
+
+def test_full_disk_in_an_episode_loses_nothing(teacher, uncut, small_disk):
+    """The run stops with one line, its last checkpoint loads, and with space it goes on."""
+    argv, run = cut_command(teacher, small_disk), small_disk / FINETUNED
+    with before_call(diswm.Replay, "add", 2, lambda: fill(small_disk)):
         refuse(*argv, says="No space left")
-    assert checkpoint.read_bytes() == before and diswm.read_checkpoint(checkpoint)
-    assert not list(tmp_path.rglob("*.tmp"))
+    assert diswm.read_checkpoint(run / "checkpoint.pt") and not list(run.rglob("*.tmp"))
+    (small_disk / "filler").unlink()
     succeed(*argv)
-    assert_identical(everything(checkpoint.parent), uncut)
+    assert_identical(everything(run), uncut)
 
 
-def test_kill_during_a_save_leaves_the_old_checkpoint_valid(teacher, uncut, tmp_path):
-    """What SIGKILL leaves: a half-written temporary file beside the last whole checkpoint."""
-    argv = cut_command(teacher, tmp_path)
-    interrupt(diswm.ActionRepeat, "step", 40, argv)
-    checkpoint = next(tmp_path.rglob("checkpoint.pt"))
-    whole = checkpoint.read_bytes()
-    (checkpoint.parent / "checkpoint.pt.tmp").write_bytes(whole[: len(whole) // 2])
-    (checkpoint.parent / "episodes/000001.npz.tmp").write_bytes(b"PK")
+@pytest.mark.parametrize("owner, name, call", [
+    (diswm.Run, "save", 3), (tensorboard.SummaryWriter, "add_scalar", 9), (io, "BytesIO", 3)],
+    ids=["config.json", "TensorBoard", "checkpoint"])
+def test_full_disk_in_pretraining_loses_nothing(
+        owner, name, call, root, brief, small_disk, monkeypatch):
+    """Wherever it strikes; TensorBoard, which else writes every two minutes, does so at once."""
+    argv, run = pretrain_command(root, small_disk), small_disk / PRETRAINED
+    monkeypatch.setattr(tensorboard, "SummaryWriter", functools.partial(
+        tensorboard.SummaryWriter, max_queue=1, flush_secs=0))
+    with before_call(owner, name, call, lambda: fill(small_disk)):
+        refuse(*argv, says="No space left")
+    assert diswm.read_checkpoint(run / "checkpoint.pt") and not list(run.rglob("*.tmp"))
+    (small_disk / "filler").unlink()
     succeed(*argv)
-    assert_identical(everything(checkpoint.parent), uncut)
+    assert_identical(everything(run), brief)
 
 
-@slow
-def test_repeated_kills_of_a_real_process_change_nothing(teacher, uncut, tmp_path):
-    """SIGKILL at four moments of four processes, then one that finishes."""
-    argv = [sys.executable, diswm.__file__, *map(str, cut_command(teacher, tmp_path))]
-    kills = 0
-    while kills < 4:
-        process = subprocess.Popen(argv, stdout=subprocess.PIPE, text=True)
-        for line in process.stdout:
-            if "/260 env steps" in line:  # an episode is done: the next one is under way
-                break
-        time.sleep(0.15 * kills)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
-        kills += 1
-    subprocess.run(argv, check=True, capture_output=True)
-    assert_identical(everything(next(tmp_path.rglob("seed0"))), uncut)
+def test_log_row_that_no_longer_fits_is_written_again_whole(root, brief, tmp_path):
+    """A real limit on file sizes tears the row after ten bytes; the next run takes them back."""
+    argv, run = pretrain_command(root, tmp_path), tmp_path / PRETRAINED
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def tear():
+        size = (run / "metrics.jsonl").stat().st_size + 10
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+
+    try:
+        with before_call(diswm, "mean_metrics", 2, tear):
+            code, _, err = run_cli(*argv)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 1 and "File too large" in err
+    assert not (run / "metrics.jsonl").read_bytes().endswith(b"\n")
+    assert len(diswm.read_log(run)) == 1
+    succeed(*argv)
+    assert_identical(everything(run), brief)
 
 
-@slow
-def test_ctrl_c_of_a_real_process_exits_130(teacher, tmp_path):
-    """SIGINT, as a terminal sends it: one line, no traceback."""
-    argv = [sys.executable, diswm.__file__, *map(str, cut_command(teacher, tmp_path))]
-    process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if "/260 env steps" in line:
-            break
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate()
-    assert process.returncode == 130 and "Traceback" not in err and "interrupted" in err
+def test_log_shorter_than_its_checkpoint_says_is_refused(finished, tmp_path):
+    """Filling it up with zero bytes, as truncation to a larger size does, would tear it."""
+    run = tmp_path / FINETUNED
+    shutil.copytree(finished, run)
+    with open(run / "metrics.jsonl", "r+b") as file:
+        file.truncate(100)
+    argv = ("finetune", "--dst", "walker_walk", "--runs", tmp_path, *DEBUG)
+    refuse(*argv, says=("metrics.jsonl", "shorter"))
+    (run / "metrics.jsonl").unlink()
+    succeed(*argv)
 
 
 # === System: bad input ============================================================================
