@@ -1388,6 +1388,8 @@ def evaluate(folder, device, episodes=None):
 # === Figures ======================================================================================
 
 TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
+FRAMES, DECISIONS = 2000, 50  # that disentanglement is measured on; of an episode
+MATERIALS = dict(grid="floor", self="body")  # dm_control's names
 
 def to_picture(image):
     """float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)"""
@@ -1422,6 +1424,78 @@ def open_loop(model, batch, context=5):
     truth, prediction = batch["image"][0], model.decoder(torch.cat(feats, 1))[0].clamp(-0.5, 0.5)
     return np.stack([to_picture(x) for x in (truth, prediction, (prediction - truth) / 2)])
 
+def labelled_frames(cfg):
+    """Random episodes of `cfg.dst` in which all that the simulator knows varies: the colours of the
+    materials that show, each channel drawn anew for each frame, by itself, from the union of both
+    phases' intervals; joint positions, m, and angles, rad, full turns taken off.
+    Returns images, uint8 (N, 64, 64, 3), factors (N, K), and their K names."""
+    images, factors, rng = [], [], np.random.default_rng(cfg.seed)
+    with contextlib.closing(config_env(replace(cfg, color_step_std=0.0), cfg.dst, "none")) as env:
+        model, data = env.unwrapped.model, env.unwrapped.data
+        rgb = model.mat_rgba[:, :3]
+        boxes = [color_box(phase, rgb.copy(), cfg.colors, cfg.color_range) for phase in PHASES[:2]]
+        def painted(material, value):
+            rgb[material] = value
+            return env.render()
+        shown = [m for m in range(model.nmat) if (painted(m, 0) != painted(m, 1)).any()]
+        def policy(image, action, state):
+            rgb[:] = rng.uniform(np.min(boxes, 0)[0], np.max(boxes, 0)[1])
+            return rng.uniform(-1, 1, action.shape).astype(np.float32), None
+        def each(info):
+            factors.append(np.concatenate([rgb[shown].ravel(), data.qpos]))
+            return len(factors) % DECISIONS == 0
+        while len(factors) < FRAMES:
+            seed = episode_seed(cfg.seed, EVALUATION, len(factors))
+            images += [row["image"] for row in play_episode(env, policy, seed, "none", each)[1:]]
+        names = [f"{MATERIALS.get(name, name)} colour ({channel})" for m in shown
+                 for name in [model.mat(m).name] for channel in ("red", "green", "blue")]
+        for j in map(model.joint, range(model.njnt)):
+            names += [f"{j.name} {i}".removesuffix(" 0") for i in range(len(j.qpos0))]
+        turns = model.jnt_qposadr[(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+                                  & (model.jnt_limited == 0)] - model.nq
+    factors = np.array(factors)
+    factors[:, turns] = np.angle(np.exp(1j * factors[:, turns]))
+    varies = np.ptp(factors, 0) > 1e-6
+    return np.array(images), factors[:, varies], list(np.array(names)[varies])
+
+def disentanglement(codes, factors):
+    """DCI (Eastwood & Williams 2018) and MIG (Chen et al. 2018): codes (N, Z) for factors (N, K).
+    Returns two dicts. Scores, 1 is best: `disentanglement`, a latent has one factor; `completeness`,
+    a factor one latent; `informativeness`, mean R², none below 0; `mig`. By factor: `r2` (K,), and
+    `information` (K, Z), a latent's share of its entropy, of 20 bins each. Importance and R² are of
+    gradient boosting, learnt from the first three quarters, tested on the rest."""
+    from scipy.stats import entropy  # slow to import
+    from sklearn.ensemble import GradientBoostingRegressor
+    from sklearn.metrics import mutual_info_score
+    n, importance, r2, information = len(codes) * 3 // 4, [], [], []
+    for factor in factors.T:
+        trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
+        importance.append(trees.feature_importances_ + 1e-12)
+        r2.append(max(0.0, trees.score(codes[n:], factor[n:])))
+        tables = [np.histogram2d(factor, code, 20)[0] for code in codes.T]
+        shared = [mutual_info_score(None, None, contingency=table) for table in tables]
+        information.append(np.divide(shared, entropy(tables[0].sum(1))).tolist())
+    of_latents = 1 - entropy(importance, base=max(2, factors.shape[1]), axis=0)       # (Z,)
+    of_factors = 1 - entropy(importance, base=max(2, codes.shape[1]), axis=1)         # (K,)
+    best = np.sort(information)[:, -2:]
+    return dict(disentanglement=np.average(of_latents, weights=np.sum(importance, 0)),
+                completeness=of_factors.mean(), informativeness=statistics.fmean(r2),
+                mig=np.ptp(best, 1).mean()), dict(r2=r2, information=information)
+
+@torch.no_grad()
+def measure(cfg, encoders, path):
+    """Is it disentangled? Score the means of encoders, {name: encoder}, print and write JSON.
+    Returns the factor of `cfg.dst` that each latent of the last encoder follows most."""
+    images, factors, names = labelled_frames(cfg)
+    frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
+    for name, encoder in encoders.items():
+        codes = torch.cat([encoder(preprocess(part.to(cfg.device)))[0] for part in frames])
+        scores, by_factor = disentanglement(codes.cpu().numpy(), factors)
+        result[name] = scores | by_factor
+        print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")
+    path.write_text(json.dumps(result, indent=2) + "\n")
+    return [names[best] for best in np.argmax(by_factor["information"], 0)]
+
 def draw_grid(pictures, rows, columns, path, title=""):
     """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
     from matplotlib.figure import Figure  # slow to import
@@ -1435,13 +1509,16 @@ def draw_grid(pictures, rows, columns, path, title=""):
     axes.figure.savefig(path, dpi=100, bbox_inches="tight")
     print(f"wrote {path}")
 
-def traverse(folder, device):
-    """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder."""
+def traverse(folder, device, metrics=False):
+    """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder.
+    metrics: also write disentanglement.json, and name what each latent of the picture follows."""
     folder = Path(folder)
     cfg, model, trainer = load_model(folder, device)
     online = isinstance(model, Agent)
     replay = Replay(folder / "episodes") if online else Replay(trainer["videos"], keys=VIDEO_KEYS)
-    model = model.model if online else model
+    teacher, model = (model.teacher, model.model) if online else (None, model)
+    if metrics and cfg.encoder != "beta_vae":
+        raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
         raise UserError(f"the episodes of {folder} are gone; nothing to draw from")
     # From the middle of the last episode: the colours of the end, and a pose that is not the start.
@@ -1457,8 +1534,14 @@ def traverse(folder, device):
                   "open-loop prediction: frames 5 … are predicted, not seen")
         if cfg.encoder == "beta_vae":
             pictures, nats = latent_traversal(model, batch)
-            order = np.argsort(-nats)                                         # informative first
-            draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats" for i in order],
+            order, follows = np.argsort(-nats), [""] * len(nats)              # informative first
+            if metrics:
+                torch.manual_seed(cfg.seed)                                   # as training began
+                start = type(model)(cfg, model.rssm.action_dim).to(device).encoder
+                encoders = dict(teacher=teacher, start=start, end=model.encoder)
+                encoders = {name: encoder for name, encoder in encoders.items() if encoder}
+                follows = measure(cfg, encoders, folder / "disentanglement.json")
+            draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats  {follows[i]}" for i in order],
                       ["recon.", *TRAVERSAL], folder / "traversal.png")
 
 def read_log(folder):
@@ -1469,8 +1552,34 @@ def read_log(folder):
     except ValueError as error:
         raise UserError(f"{path} is not a log of ours ({error}); remove it") from None
 
+def curve_figures(runs, switch=None):
+    """Interquartile means over seeds and bootstrap 95 % intervals as rliable defines them.
+    runs: {env step: evaluation return} of each seed, of which the steps that all share count;
+    switch: the step at which colours change. Returns a dict of `steps`, `switch` and, (iqm, low,
+    high) each or (iqm,) of one seed: the `curve`; the `final` three evaluations' mean; the `area`
+    under the curve over its length in steps; the evaluations just `before` and `after` the switch.
+    """
+    from scipy.stats import bootstrap, trim_mean  # slow to import
+    steps = sorted(set.intersection(*map(set, runs)))
+    if not steps:
+        raise UserError("the seeds of a method share no evaluation step; name fewer runs to plot")
+    values = np.array([[run[step] for step in steps] for run in runs])        # (seeds, steps)
+    area = np.trapezoid(values, steps) / (steps[-1] - steps[0]) if steps[1:] else values[:, 0]
+    figures = dict(curve=values, final=values[:, -3:].mean(1), area=area)
+    if switch and steps[0] <= switch < steps[-1]:
+        after = np.searchsorted(steps, switch, "right")
+        figures |= dict(before=values[:, after - 1], after=values[:, after])
+    def iqm(values, axis=0):
+        return trim_mean(values, 0.25, axis)
+    for name, values in figures.items():
+        interval = bootstrap([values], iqm, n_resamples=50_000, batch=1000, method="percentile",
+                             rng=0).confidence_interval if len(runs) > 1 else ()
+        figures[name] = [estimate.tolist() for estimate in (iqm(values), *interval)]
+    return dict(seeds=len(runs), steps=steps, switch=switch) | figures
+
 def plot(folders, path):
-    """Evaluation returns of runs …/<tasks>/<method>/seed<k>: mean and spread over seeds."""
+    """Evaluation returns of runs …/<tasks>/<method>/seed<k>: interquartile mean, 95 % interval.
+    Draws them, prints `curve_figures`, and writes these beside the picture as JSON."""
     from matplotlib.figure import Figure  # slow to import
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
     for folder in map(Path, folders):
@@ -1484,25 +1593,29 @@ def plot(folders, path):
                 switches[tasks] = last["train"]
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
-    figure = Figure(figsize=(5.5 * len(curves), 3.8))
+    figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), Path(path)
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
+        print(f"{tasks}: evaluation returns as [interquartile mean, ends of its 95 % interval]")
         for method, runs in sorted(methods.items()):
-            steps = sorted(set.intersection(*map(set, runs)))
-            values = np.array([[run[step] for step in steps] for run in runs])
-            mean, spread = values.mean(0), values.std(0)
-            line, = axes.plot(steps, mean, marker=".", label=f"{method}, {len(runs)} seed(s)")
-            color = line.get_color()
-            axes.fill_between(steps, mean - spread, mean + spread, alpha=0.2, color=color)
+            figures = methods[method] = curve_figures(runs, switches.get(tasks))
+            (mean, *interval), steps = figures["curve"], figures["steps"]
+            label = f"{method}, {len(runs)} seed{'s' if interval else ''}"
+            line, = axes.plot(steps, mean, marker=".", label=label)
+            if interval:
+                axes.fill_between(steps, *interval, alpha=0.2, color=line.get_color())
+            print(f"  {label}:", *(f"{name} {np.round(figures[name], 1).tolist()}"
+                                   for name in ("final", "area", "before", "after") if name in figures))
         if tasks in switches:
             axes.axvline(switches[tasks], color="gray", ls=":", label="the colours change")
         axes.set(title=tasks.replace("-", " → "), xlabel="env steps", ylabel="evaluation return",
                  ylim=(0, None))
         axes.legend()
         axes.grid(alpha=0.3)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100, bbox_inches="tight")
-    print(f"wrote {path}")
+    path.with_suffix(".json").write_text(json.dumps(curves, indent=2) + "\n")
+    print(f"wrote {path} and {path.stem}.json")
 
 # === Doctor and bench =============================================================================
 
@@ -1605,6 +1718,8 @@ def parse_args(argv):
         sub.add_argument("--fresh", action="store_true", help="start over instead of resuming")
         if name in ("evaluate", "traverse"):
             sub.add_argument("--run", required=True, help="folder of a run: runs/…/seed0")
+        if name == "traverse":
+            sub.add_argument("--metrics", action="store_true", help="also measure disentanglement")
         if name == "plot":
             sub.add_argument("run", nargs="*", help="folders of runs; default: all finetune runs")
             sub.add_argument("--out", help="PNG to write; default: curves.png in --runs")
@@ -1643,8 +1758,10 @@ def run_command(argv):
     cfg, command = prepare_machine(cfg), globals()[args.command]
     if command in (collect, pretrain, finetune):
         command(cfg, args.fresh)
-    elif command in (evaluate, traverse):
-        command(args.run, torch.device(cfg.device))
+    elif command is evaluate:
+        evaluate(args.run, torch.device(cfg.device))
+    elif command is traverse:
+        traverse(args.run, torch.device(cfg.device), args.metrics)
     elif command is plot:
         runs = Path(cfg.runs)
         plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")
