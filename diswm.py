@@ -1390,6 +1390,7 @@ def evaluate(folder, device, episodes=None):
 TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
 FRAMES, DECISIONS = 2000, 50  # that disentanglement is measured on; of an episode
 MATERIALS = dict(grid="floor", self="body")  # dm_control's names
+CURVE = ("final", "area", "before", "after")  # what plot prints
 
 def to_picture(image):
     """float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)"""
@@ -1425,10 +1426,9 @@ def open_loop(model, batch, context=5):
     return np.stack([to_picture(x) for x in (truth, prediction, (prediction - truth) / 2)])
 
 def labelled_frames(cfg):
-    """Random episodes of `cfg.dst` in which all that the simulator knows varies: the colours of the
-    materials that show, each channel drawn anew for each frame, by itself, from the union of both
-    phases' intervals; joint positions, m, and angles, rad, full turns taken off.
-    Returns images, uint8 (N, 64, 64, 3), factors (N, K), and their K names."""
+    """Random episodes of `cfg.dst` whose colours are drawn anew for each frame, each channel by
+    itself from the union of both phases' intervals. Returns images, uint8 (N, 64, 64, 3), factors
+    (N, K): colours that show, joint positions, m, and angles, rad, in (−π, π]; and their names."""
     images, factors, rng = [], [], np.random.default_rng(cfg.seed)
     with contextlib.closing(config_env(replace(cfg, color_step_std=0.0), cfg.dst, "none")) as env:
         model, data = env.unwrapped.model, env.unwrapped.data
@@ -1438,32 +1438,28 @@ def labelled_frames(cfg):
             rgb[material] = value
             return env.render()
         shown = [m for m in range(model.nmat) if (painted(m, 0) != painted(m, 1)).any()]
-        def policy(image, action, state):
-            rgb[:] = rng.uniform(np.min(boxes, 0)[0], np.max(boxes, 0)[1])
-            return rng.uniform(-1, 1, action.shape).astype(np.float32), None
         def each(info):
             factors.append(np.concatenate([rgb[shown].ravel(), data.qpos]))
+            rgb[:] = rng.uniform(np.min(boxes, 0)[0], np.max(boxes, 0)[1])   # of the next frame
             return len(factors) % DECISIONS == 0
         while len(factors) < FRAMES:
             seed = episode_seed(cfg.seed, EVALUATION, len(factors))
-            images += [row["image"] for row in play_episode(env, policy, seed, "none", each)[1:]]
-        names = [f"{MATERIALS.get(name, name)} colour ({channel})" for m in shown
-                 for name in [model.mat(m).name] for channel in ("red", "green", "blue")]
-        for j in map(model.joint, range(model.njnt)):
-            names += [f"{j.name} {i}".removesuffix(" 0") for i in range(len(j.qpos0))]
-        turns = model.jnt_qposadr[(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
-                                  & (model.jnt_limited == 0)] - model.nq
+            rows = play_episode(env, random_policy(env, seed), seed, "train", each)
+            images += [row["image"] for row in rows[1:]]
+    names = [f"{MATERIALS.get(material.name, material.name)} colour ({channel})"
+             for material in map(model.mat, shown) for channel in ("red", "green", "blue")]
+    names += [f"{joint.name} {i}".removesuffix(" 0")
+              for joint in map(model.joint, range(model.njnt)) for i in range(len(joint.qpos0))]
     factors = np.array(factors)
-    factors[:, turns] = np.angle(np.exp(1j * factors[:, turns]))
-    varies = np.ptp(factors, 0) > 1e-6
-    return np.array(images), factors[:, varies], list(np.array(names)[varies])
+    angles = 3 * len(shown) + model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
+    factors[:, angles] = np.angle(np.exp(1j * factors[:, angles]))
+    varies = np.ptp(factors, 0) > 0
+    return np.array(images), factors[:, varies], np.array(names)[varies].tolist()
 
 def disentanglement(codes, factors):
-    """DCI (Eastwood & Williams 2018) and MIG (Chen et al. 2018): codes (N, Z) for factors (N, K).
-    Returns two dicts. Scores, 1 is best: `disentanglement`, a latent has one factor; `completeness`,
-    a factor one latent; `informativeness`, mean R², none below 0; `mig`. By factor: `r2` (K,), and
-    `information` (K, Z), a latent's share of its entropy, of 20 bins each. Importance and R² are of
-    gradient boosting, learnt from the first three quarters, tested on the rest."""
+    """DCI (Eastwood & Williams 2018) and MIG (Chen et al. 2018, 20 bins), 1 is best; codes (N, Z),
+    factors (N, K). Gradient boosting gives importance and, on the last quarter, held out, the R² of
+    `informativeness`. Returns a dict of scores, and each latent's share of each R², (K, Z)."""
     from scipy.stats import entropy  # slow to import
     from sklearn.ensemble import GradientBoostingRegressor
     from sklearn.metrics import mutual_info_score
@@ -1471,30 +1467,33 @@ def disentanglement(codes, factors):
     for factor in factors.T:
         trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
         importance.append(trees.feature_importances_ + 1e-12)
-        r2.append(max(0.0, trees.score(codes[n:], factor[n:])))
+        r2.append([max(0.0, trees.score(codes[n:], factor[n:]))])
         tables = [np.histogram2d(factor, code, 20)[0] for code in codes.T]
         shared = [mutual_info_score(None, None, contingency=table) for table in tables]
-        information.append(np.divide(shared, entropy(tables[0].sum(1))).tolist())
+        information.append(np.sort(shared) / entropy(tables[0].sum(1)))
     of_latents = 1 - entropy(importance, base=max(2, factors.shape[1]), axis=0)       # (Z,)
     of_factors = 1 - entropy(importance, base=max(2, codes.shape[1]), axis=1)         # (K,)
-    best = np.sort(information)[:, -2:]
     return dict(disentanglement=np.average(of_latents, weights=np.sum(importance, 0)),
-                completeness=of_factors.mean(), informativeness=statistics.fmean(r2),
-                mig=np.ptp(best, 1).mean()), dict(r2=r2, information=information)
+                completeness=of_factors.mean(), informativeness=np.mean(r2),
+                mig=np.ptp(np.array(information)[:, -2:], 1).mean()), np.multiply(importance, r2)
 
 @torch.no_grad()
-def measure(cfg, encoders, path):
-    """Is it disentangled? Score the means of encoders, {name: encoder}, print and write JSON.
-    Returns the factor of `cfg.dst` that each latent of the last encoder follows most."""
+def measure(cfg, model, teacher, path):
+    """Is it disentangled? Score the latents' means: a teacher's, the model's at the start and end
+    of its training. Prints and writes JSON; returns what each latent at the end follows most."""
     images, factors, names = labelled_frames(cfg)
     frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
+    torch.manual_seed(cfg.seed)                                               # as training began
+    start = type(model)(cfg, model.rssm.action_dim).to(cfg.device)
+    encoders = (dict(teacher=teacher) if teacher else {}) | dict(
+        start=start.encoder, end=model.encoder)
     for name, encoder in encoders.items():
-        codes = torch.cat([encoder(preprocess(part.to(cfg.device)))[0] for part in frames])
-        scores, by_factor = disentanglement(codes.cpu().numpy(), factors)
-        result[name] = scores | by_factor
+        codes = torch.cat([encoder(preprocess(part.to(cfg.device)))[0].cpu() for part in frames])
+        scores, share = disentanglement(codes.numpy(), factors)
+        result[name] = scores | dict(share=share.tolist())
         print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")
     path.write_text(json.dumps(result, indent=2) + "\n")
-    return [names[best] for best in np.argmax(by_factor["information"], 0)]
+    return [f"{names[k]} {row[k]:.2f}" for row, k in zip(share.T, share.argmax(0), strict=True)]
 
 def draw_grid(pictures, rows, columns, path, title=""):
     """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
@@ -1534,13 +1533,8 @@ def traverse(folder, device, metrics=False):
                   "open-loop prediction: frames 5 … are predicted, not seen")
         if cfg.encoder == "beta_vae":
             pictures, nats = latent_traversal(model, batch)
-            order, follows = np.argsort(-nats), [""] * len(nats)              # informative first
-            if metrics:
-                torch.manual_seed(cfg.seed)                                   # as training began
-                start = type(model)(cfg, model.rssm.action_dim).to(device).encoder
-                encoders = dict(teacher=teacher, start=start, end=model.encoder)
-                encoders = {name: encoder for name, encoder in encoders.items() if encoder}
-                follows = measure(cfg, encoders, folder / "disentanglement.json")
+            order, path = np.argsort(-nats), folder / "disentanglement.json"  # informative first
+            follows = measure(cfg, model, teacher, path) if metrics else [""] * len(nats)
             draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats  {follows[i]}" for i in order],
                       ["recon.", *TRAVERSAL], folder / "traversal.png")
 
@@ -1553,12 +1547,10 @@ def read_log(folder):
         raise UserError(f"{path} is not a log of ours ({error}); remove it") from None
 
 def curve_figures(runs, switch=None):
-    """Interquartile means over seeds and bootstrap 95 % intervals as rliable defines them.
-    runs: {env step: evaluation return} of each seed, of which the steps that all share count;
-    switch: the step at which colours change. Returns a dict of `steps`, `switch` and, (iqm, low,
-    high) each or (iqm,) of one seed: the `curve`; the `final` three evaluations' mean; the `area`
-    under the curve over its length in steps; the evaluations just `before` and `after` the switch.
-    """
+    """Interquartile means over seeds with bootstrap 95 % intervals, as rliable defines them.
+    runs: {env step: evaluation return} of each seed, of which the steps that all share count.
+    Returns [iqm, low, high], or [iqm] of one seed, of the curve, the mean of its last three points,
+    its area by its length in steps, and the points just before and after the env step `switch`."""
     from scipy.stats import bootstrap, trim_mean  # slow to import
     steps = sorted(set.intersection(*map(set, runs)))
     if not steps:
@@ -1572,7 +1564,7 @@ def curve_figures(runs, switch=None):
     def iqm(values, axis=0):
         return trim_mean(values, 0.25, axis)
     for name, values in figures.items():
-        interval = bootstrap([values], iqm, n_resamples=50_000, batch=1000, method="percentile",
+        interval = bootstrap([values], iqm, n_resamples=50_000, batch=5000, method="percentile",
                              rng=0).confidence_interval if len(runs) > 1 else ()
         figures[name] = [estimate.tolist() for estimate in (iqm(values), *interval)]
     return dict(seeds=len(runs), steps=steps, switch=switch) | figures
@@ -1596,7 +1588,6 @@ def plot(folders, path):
     figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), Path(path)
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
-        print(f"{tasks}: evaluation returns as [interquartile mean, ends of its 95 % interval]")
         for method, runs in sorted(methods.items()):
             figures = methods[method] = curve_figures(runs, switches.get(tasks))
             (mean, *interval), steps = figures["curve"], figures["steps"]
@@ -1604,8 +1595,8 @@ def plot(folders, path):
             line, = axes.plot(steps, mean, marker=".", label=label)
             if interval:
                 axes.fill_between(steps, *interval, alpha=0.2, color=line.get_color())
-            print(f"  {label}:", *(f"{name} {np.round(figures[name], 1).tolist()}"
-                                   for name in ("final", "area", "before", "after") if name in figures))
+            print(f"{tasks}: {label}", *(f"{name} {np.round(value, 1).tolist()}" for name, value
+                                         in figures.items() if name in CURVE), sep=", ")
         if tasks in switches:
             axes.axvline(switches[tasks], color="gray", ls=":", label="the colours change")
         axes.set(title=tasks.replace("-", " → "), xlabel="env steps", ylabel="evaluation return",
