@@ -34,8 +34,8 @@ import contextlib
 import ctypes
 import dataclasses
 import difflib
-import functools
 import fcntl
+import functools
 import io
 import json
 import math
@@ -944,6 +944,7 @@ TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
 OTHER_TASKS = ("pusher", "drawer_open", "drawer_close")
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
+MATERIALS = dict(grid="floor", self="body")  # dm_control's names
 TRAINING, EVALUATION = 0, 1  # streams of episode_seed
 
 def family(task):
@@ -1069,19 +1070,22 @@ def color_box(phase, original, colors="published", half_range=0.2):
     return np.clip(center - half_range, 0, 1), np.clip(center + half_range, 0, 1)
 
 def color_groups(task, model):
-    """What the distractor colours: (RGBA array, rows that share a colour) pairs."""
+    """What the distractor colours: (name, RGBA array, rows that share a colour) of each group."""
+    materials = [(MATERIALS.get(model.mat(i).name, model.mat(i).name), model.mat_rgba, [i])
+                 for i in range(model.nmat)]
     if task in TASKS:
-        return [(model.mat_rgba, [i]) for i in range(model.nmat)]
+        return materials
     if family(task) == "drawer":
         return []                                                             # textures instead
+    geoms = [(model.geom(i).name or f"geom {i}", model.geom_rgba, [i]) for i in range(model.ngeom)]
     if task == "pusher":                                                      # published
         arm = [model.geom(name).id for name in ("uar", "ua", "ef", "sp", "fa", "sl", "e1", "e2")]
         thing, table = model.body("object").geomadr[0], model.geom("table").id
-        return [(model.geom_rgba, rows) for rows in ([thing], [table], arm)]
+        return [("object", model.geom_rgba, [thing]), geoms[table], ("arm", model.geom_rgba, arm)]
     # MuJoCo shows a geom's material where there is one and its own colour is the default.
     own = (model.geom_matid < 0) | (model.geom_rgba != (0.5, 0.5, 0.5, 1)).any(1)
-    return [*((model.mat_rgba, [i]) for i in np.unique(model.geom_matid[~own])),
-            *((model.geom_rgba, [i]) for i in np.flatnonzero(own))]
+    return [*(materials[i] for i in np.unique(model.geom_matid[~own])),
+            *(geoms[i] for i in np.flatnonzero(own))]
 
 class ColorDistractor(gym.Wrapper):
     """Each episode, draw the colours of groups from a random stream of their own.
@@ -1092,7 +1096,7 @@ class ColorDistractor(gym.Wrapper):
         self.phase, self.colors = phase, colors
         self.half_range, self.step_std = half_range, step_std
         self.groups = color_groups(task, self.unwrapped.model)
-        self.original = [array[rows, :3] for array, rows in self.groups]      # copies
+        self.original = [array[rows, :3] for _, array, rows in self.groups]   # copies
         # The first group of the Pusher, the object, is black (published).
         self.tint = np.arange(len(self.groups))[:, None] >= (task == "pusher")
         self.rng = np.random.default_rng()
@@ -1100,7 +1104,7 @@ class ColorDistractor(gym.Wrapper):
     def paint(self, colors):
         """Give each group its colour, or its rows theirs."""
         self.current = colors
-        for (array, rows), color in zip(self.groups, colors, strict=True):
+        for (_, array, rows), color in zip(self.groups, colors, strict=True):
             array[rows, :3] = color
 
     def reset(self, *, seed=None, options=None):
@@ -1708,6 +1712,8 @@ def evaluate(folder, device, episodes=None):
 # === Figures ======================================================================================
 
 TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
+FRAMES, DECISIONS = 2000, 50  # that disentanglement is measured on; of an episode
+CURVE = ("final", "area", "before", "after")  # what plot prints
 
 def to_picture(image):
     """float (..., 3, h, w) in [−0.5, 0.5] → uint8 (..., h, w, 3)"""
@@ -1742,6 +1748,78 @@ def open_loop(model, batch, context=5):
     truth, prediction = batch["image"][0], model.decoder(torch.cat(feats, 1))[0].clamp(-0.5, 0.5)
     return np.stack([to_picture(x) for x in (truth, prediction, (prediction - truth) / 2)])
 
+def labelled_frames(cfg):
+    """Random episodes of `cfg.dst` whose colours are drawn anew for each frame, each channel by
+    itself from the union of both phases' intervals. Returns images, uint8 (N, 64, 64, 3), factors
+    (N, K): colours that show, joint positions, m, and angles, rad, in (−π, π]; and their names."""
+    images, factors, rng = [], [], np.random.default_rng(cfg.seed)
+    with contextlib.closing(config_env(replace(cfg, color_step_std=0.0), cfg.dst, "none")) as env:
+        model, data, painter = env.unwrapped.model, env.unwrapped.data, env.env
+        original = np.array([array[rows[0], :3] for _, array, rows in painter.groups])
+        boxes = [color_box(phase, original, cfg.colors, cfg.color_range) for phase in PHASES[:2]]
+        def rendered(group, value):
+            painter.paint(np.where(np.arange(len(original))[:, None] == group, value, original))
+            return env.render()
+        shown = [group for group in range(len(original))
+                 if (rendered(group, 0) != rendered(group, 1)).any()]
+        over = True
+        while len(factors) < FRAMES:
+            if over:
+                env.reset(seed=episode_seed(cfg.seed, EVALUATION, len(factors)))
+            painter.paint(rng.uniform(np.min(boxes, 0)[0], np.max(boxes, 0)[1]))
+            image, _, *ends, _ = env.step(rng.uniform(-1, 1, env.action_space.shape))
+            over = any(ends) or len(factors) % DECISIONS == DECISIONS - 1
+            images.append(image)
+            factors.append(np.concatenate([painter.current[shown].ravel(), data.qpos]))
+    names = [f"{painter.groups[group][0]} colour ({channel})" for group in shown
+             for channel in ("red", "green", "blue")]
+    names += [f"{joint.name} {i}".removesuffix(" 0")
+              for joint in map(model.joint, range(model.njnt)) for i in range(len(joint.qpos0))]
+    factors = np.array(factors)
+    angles = 3 * len(shown) + model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
+    factors[:, angles] = np.angle(np.exp(1j * factors[:, angles]))
+    varies = np.ptp(factors, 0) > 0
+    return np.array(images), factors[:, varies], np.array(names)[varies].tolist()
+
+def disentanglement(codes, factors):
+    """DCI (Eastwood & Williams 2018) and MIG (Chen et al. 2018, 20 bins), 1 is best; codes (N, Z),
+    factors (N, K). Gradient boosting gives importance and, on the last quarter, held out, the R² of
+    `informativeness`. Returns a dict of scores, and each latent's share of each R², (K, Z)."""
+    from scipy.stats import entropy  # slow to import
+    from sklearn.ensemble import GradientBoostingRegressor
+    from sklearn.metrics import mutual_info_score
+    n, importance, r2, information = len(codes) * 3 // 4, [], [], []
+    for factor in factors.T:
+        trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
+        importance.append(trees.feature_importances_ + 1e-12)
+        r2.append([max(0.0, trees.score(codes[n:], factor[n:]))])
+        tables = [np.histogram2d(factor, code, 20)[0] for code in codes.T]
+        shared = [mutual_info_score(None, None, contingency=table) for table in tables]
+        information.append(np.sort(shared) / entropy(tables[0].sum(1)))
+    of_latents = 1 - entropy(importance, base=max(2, factors.shape[1]), axis=0)       # (Z,)
+    of_factors = 1 - entropy(importance, base=max(2, codes.shape[1]), axis=1)         # (K,)
+    return dict(disentanglement=np.average(of_latents, weights=np.sum(importance, 0)),
+                completeness=of_factors.mean(), informativeness=np.mean(r2),
+                mig=np.ptp(np.array(information)[:, -2:], 1).mean()), np.multiply(importance, r2)
+
+@torch.no_grad()
+def measure(cfg, model, teacher, path):
+    """Is it disentangled? Score the latents' means: a teacher's, the model's at the start and end
+    of its training. Prints and writes JSON; returns what each latent at the end follows most."""
+    images, factors, names = labelled_frames(cfg)
+    frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
+    torch.manual_seed(cfg.seed)                                               # as training began
+    start = type(model)(cfg, model.rssm.action_dim).to(cfg.device)
+    encoders = (dict(teacher=teacher) if teacher else {}) | dict(
+        start=start.encoder, end=model.encoder)
+    for name, encoder in encoders.items():
+        codes = torch.cat([encoder(preprocess(part.to(cfg.device)))[0].cpu() for part in frames])
+        scores, share = disentanglement(codes.numpy(), factors)
+        result[name] = scores | dict(share=share.tolist())
+        print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")
+    path.write_text(json.dumps(result, indent=2) + "\n")
+    return [f"{names[k]} {row[k]:.2f}" for row, k in zip(share.T, share.argmax(0), strict=True)]
+
 def draw_grid(pictures, rows, columns, path, title=""):
     """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
     from matplotlib.figure import Figure  # slow to import
@@ -1755,8 +1833,9 @@ def draw_grid(pictures, rows, columns, path, title=""):
     axes.figure.savefig(path, dpi=100, bbox_inches="tight")
     print(f"wrote {path}")
 
-def traverse(folder, device, videos=""):
+def traverse(folder, device, videos="", metrics=False):
     """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder.
+    metrics: also write disentanglement.json, and name what each latent of the picture follows.
     Episodes: `videos`, else the run's, else those collected beside it: none that a checkpoint,
     which may be a stranger's, could name."""
     folder = Path(folder)
@@ -1765,7 +1844,9 @@ def traverse(folder, device, videos=""):
     places = [folder / "videos", *(folder / "../../../..").glob(collected)]
     place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
     replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
-    model = model.model if online else model
+    teacher, model = (model.teacher, model.model) if online else (None, model)
+    if metrics and cfg.encoder != "beta_vae":
+        raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from (see --videos)")
     # From the middle of the last episode: the colours of the end, and a pose that is not the start.
@@ -1781,8 +1862,9 @@ def traverse(folder, device, videos=""):
                   "open-loop prediction: frames 5 … are predicted, not seen")
         if cfg.encoder == "beta_vae" and not isinstance(model.rssm, StackedRSSM):
             pictures, nats = latent_traversal(model, batch)
-            order = np.argsort(-nats)                                         # informative first
-            draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats" for i in order],
+            order, path = np.argsort(-nats), folder / "disentanglement.json"  # informative first
+            follows = measure(cfg, model, teacher, path) if metrics else [""] * len(nats)
+            draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats  {follows[i]}" for i in order],
                       ["recon.", *TRAVERSAL], folder / "traversal.png")
 
 def read_log(folder):
@@ -1798,8 +1880,32 @@ def read_log(folder):
                 raise ValueError(f"step {step}")
     return rows
 
+def curve_figures(runs, switch=None):
+    """Interquartile means over seeds with bootstrap 95 % intervals, as rliable defines them.
+    runs: {env step: evaluation return} of each seed, of which the steps that all share count.
+    Returns [iqm, low, high], or [iqm] of one seed, of the curve, the mean of its last three points,
+    its area by its length in steps, and the points just before and after the env step `switch`."""
+    from scipy.stats import bootstrap, trim_mean  # slow to import
+    steps = sorted(set.intersection(*map(set, runs)))
+    if not steps:
+        raise UserError("the seeds of a method share no evaluation step; name fewer runs to plot")
+    values = np.array([[run[step] for step in steps] for run in runs])        # (seeds, steps)
+    area = np.trapezoid(values, steps) / (steps[-1] - steps[0]) if steps[1:] else values[:, 0]
+    figures = dict(curve=values, final=values[:, -3:].mean(1), area=area)
+    if switch and steps[0] <= switch < steps[-1]:
+        after = np.searchsorted(steps, switch, "right")
+        figures |= dict(before=values[:, after - 1], after=values[:, after])
+    def iqm(values, axis=0):
+        return trim_mean(values, 0.25, axis)
+    for name, values in figures.items():
+        interval = bootstrap([values], iqm, n_resamples=50_000, batch=5000, method="percentile",
+                             rng=0).confidence_interval if len(runs) > 1 else ()
+        figures[name] = [estimate.tolist() for estimate in (iqm(values), *interval)]
+    return dict(seeds=len(runs), steps=steps, switch=switch) | figures
+
 def plot(folders, path):
-    """Evaluation returns of runs …/<tasks>/<method>/seed<k>: mean and spread over seeds."""
+    """Evaluation returns of runs …/<tasks>/<method>/seed<k>: interquartile mean, 95 % interval.
+    Draws them, prints `curve_figures`, and writes these beside the picture as JSON."""
     from matplotlib.figure import Figure  # slow to import
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
     for folder in map(Path, folders):
@@ -1813,25 +1919,28 @@ def plot(folders, path):
                 switches[tasks] = last["train"]
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
-    figure = Figure(figsize=(5.5 * len(curves), 3.8))
+    figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), Path(path)
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
         for method, runs in sorted(methods.items()):
-            steps = sorted(set.intersection(*map(set, runs)))
-            values = np.array([[run[step] for step in steps] for run in runs])
-            mean, spread = values.mean(0), values.std(0)
-            line, = axes.plot(steps, mean, marker=".", label=f"{method}, {len(runs)} seed(s)")
-            color = line.get_color()
-            axes.fill_between(steps, mean - spread, mean + spread, alpha=0.2, color=color)
+            figures = methods[method] = curve_figures(runs, switches.get(tasks))
+            (mean, *interval), steps = figures["curve"], figures["steps"]
+            label = f"{method}, {len(runs)} seed{'s' if interval else ''}"
+            line, = axes.plot(steps, mean, marker=".", label=label)
+            if interval:
+                axes.fill_between(steps, *interval, alpha=0.2, color=line.get_color())
+            print(f"{tasks}: {label}", *(f"{name} {np.round(value, 1).tolist()}" for name, value
+                                         in figures.items() if name in CURVE), sep=", ")
         if tasks in switches:
             axes.axvline(switches[tasks], color="gray", ls=":", label="the colours change")
         axes.set(title=re.sub(r"-(?!v\d)", " → ", tasks), ylim=(0, None),      # Hopper-v5
                  xlabel="env steps", ylabel="evaluation return")
         axes.legend()
         axes.grid(alpha=0.3)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100, bbox_inches="tight")
-    print(f"wrote {path}")
+    path.with_suffix(".json").write_text(json.dumps(curves, indent=2) + "\n")
+    print(f"wrote {path} and {path.stem}.json")
 
 # === Doctor and bench =============================================================================
 
@@ -1934,6 +2043,8 @@ def parse_args(argv):
         sub.add_argument("--fresh", action="store_true", help="start over instead of resuming")
         if name in ("evaluate", "traverse"):
             sub.add_argument("--run", required=True, help="folder of a run: runs/…/seed0")
+        if name == "traverse":
+            sub.add_argument("--metrics", action="store_true", help="also measure disentanglement")
         if name == "plot":
             sub.add_argument("run", nargs="*", help="folders of runs; default: all finetune runs")
             sub.add_argument("--out", help="PNG to write; default: curves.png in --runs")
@@ -1978,7 +2089,7 @@ def run_command(argv):
     elif command is evaluate:
         evaluate(args.run, torch.device(cfg.device))
     elif command is traverse:
-        traverse(args.run, torch.device(cfg.device), cfg.videos)
+        traverse(args.run, torch.device(cfg.device), cfg.videos, args.metrics)
     elif command is plot:
         runs = Path(cfg.runs)
         plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")

@@ -11,6 +11,7 @@ import copy
 import dataclasses
 import functools
 import io
+import itertools
 import json
 import os
 import resource
@@ -1996,6 +1997,250 @@ def play_on_counting(trainer):
     while trainer.progress < trainer.total:
         trainer.replay.add(trainer.play()[0][0][0])
         trainer.episodes += 1
+
+
+# === Figures: what plot and traverse report =======================================================
+
+def random_runs(seed, seeds_, steps=5):
+    """Evaluation returns of some seeds at the same steps, as `plot` reads them from the logs."""
+    returns = np.random.default_rng(seed).gamma(2, 50, (seeds_, steps))
+    return [dict(zip(range(10, 10 * steps + 1, 10), run, strict=True)) for run in returns]
+
+
+def sorted_middle(values):
+    """Interquartile mean by hand: sort, drop a quarter (rounded down) at both ends, average."""
+    drop = len(values) // 4
+    return np.mean(sorted(values)[drop:len(values) - drop])
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_interval_is_that_of_all_possible_resamples(count):
+    """rliable: percentiles of the interquartile mean over runs drawn with replacement."""
+    runs = random_runs(count, count, steps=3)
+    found = diswm.curve_figures(runs)
+    for point, step in enumerate(runs[0]):
+        returns = [run[step] for run in runs]
+        every = [sorted_middle(draw) for draw in itertools.product(returns, repeat=count)]
+        mean, low, high = (estimate[point] for estimate in found["curve"])
+        assert mean == pytest.approx(sorted_middle(returns))
+        # The exact 2.5 and 97.5 % points, give or take the bootstrap's own noise in probability.
+        for end, share in ((low, 2.5), (high, 97.5)):
+            below, above = np.percentile(
+                every, [share - 0.4, share + 0.4], method="inverted_cdf")
+            assert below - 1e-9 <= end <= above + 1e-9
+
+
+def test_interquartile_mean_ignores_a_seed_that_went_wild():
+    """Why not the mean: one of four seeds must not decide."""
+    runs = [{10: value} for value in (1.0, 2.0, 4.0, 1000.0)]
+    assert diswm.curve_figures(runs)["curve"][0] == [3.0]
+
+
+def test_one_seed_has_no_interval():
+    """A band around a single run would claim something that nobody measured."""
+    found = diswm.curve_figures(random_runs(0, 1), switch=20)
+    assert all(len(found[name]) == 1 for name in ("curve", *diswm.CURVE))
+
+
+def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
+    """area: trapezia by the steps between first and last; unequal gaps must count as such."""
+    runs = [{10: 0.0, 20: 10.0, 40: 20.0, 50: 30.0}, {10: 2.0, 20: 12.0, 40: 22.0, 50: 32.0}]
+    found = diswm.curve_figures(runs, switch=25)
+    assert found["area"][0] == pytest.approx((5 * 10 + 15 * 20 + 25 * 10) / 40 + 1)
+    assert found["final"][0] == pytest.approx(21.0)
+    assert (found["before"][0], found["after"][0]) == (11.0, 21.0)
+    at_evaluation = diswm.curve_figures(runs, switch=40)  # evaluated in the old colours still
+    assert (at_evaluation["before"][0], at_evaluation["after"][0]) == (21.0, 31.0)
+    assert "before" not in diswm.curve_figures(runs) | diswm.curve_figures(runs, switch=50)
+
+
+def test_curve_has_the_steps_that_all_seeds_have():
+    """Runs of different lengths and evaluation intervals; without a common step there is none."""
+    runs = [{10: 1.0, 20: 2.0, 30: 3.0}, {20: 4.0, 30: 5.0}, {30: 7.0, 20: 6.0, 25: 0.0}]
+    found = diswm.curve_figures(runs)
+    assert (found["seeds"], found["steps"]) == (3, [20, 30])
+    assert found["curve"][0] == pytest.approx([4.0, 5.0])
+    with pytest.raises(UserError, match="share no"):
+        diswm.curve_figures([{10: 1.0}, {20: 1.0}])
+
+
+def test_plot_writes_and_prints_the_figures_of_each_method(tmp_path):
+    """curves.json beside the picture: tasks → method → figures, the switch read from the log."""
+    for seed, offset in enumerate((0, 10)):
+        folder = tmp_path / f"finetune/a-b/diswm/seed{seed}"
+        folder.mkdir(parents=True)
+        rows = [dict(step=step, phase="train" if step <= 20 else "shifted",
+                     eval_return=step + offset) for step in (10, 20, 30, 40)]
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    out = succeed("plot", "--runs", tmp_path)
+    found = json.loads((tmp_path / "curves.json").read_text())["a-b"]["diswm"]
+    assert (found["seeds"], found["switch"], found["steps"]) == (2, 20, [10, 20, 30, 40])
+    assert found["final"] == [35.0, 30.0, 40.0] and found["area"] == [30.0, 25.0, 35.0]
+    assert (found["before"][0], found["after"][0]) == (25.0, 35.0)
+    assert "a-b: diswm, 2 seeds, final [35.0, 30.0, 40.0]" in out
+    check_picture(tmp_path / "curves.png")
+
+
+def score(codes, factors):
+    """The four scores, a latent's share of each factor (K, Z)."""
+    return diswm.disentanglement(np.asarray(codes), np.asarray(factors))
+
+
+def uniform_factors(count=3, rows=1200, seed=0):
+    """Independent factors."""
+    return np.random.default_rng(seed).uniform(-1, 1, (rows, count))
+
+
+def check_permuted_factors_are_disentangled():
+    """Codes that are the factors, in another order and scale, beside noise of no use."""
+    factors = uniform_factors()
+    noise = uniform_factors(2, seed=1)
+    scores, share = score(np.hstack([factors[:, [2, 0, 1]] * [-9, 0.1, 1], noise]), factors)
+    assert min(scores.values()) > 0.9
+    assert share.argmax(1).tolist() == [1, 2, 0] and share[:, 3:].max() < 0.02
+
+
+def check_rotated_factors_are_entangled():
+    """Every code is a mixture of all factors: all is known, nothing is separate."""
+    factors = uniform_factors()
+    rotation = np.array([[1, -2, 2], [2, -1, -2], [2, 2, 1]]) / 3
+    scores, _ = score(factors @ rotation.T, factors)
+    assert scores["informativeness"] > 0.8
+    assert max(scores["disentanglement"], scores["completeness"]) < 0.4 and scores["mig"] < 0.15
+
+
+def check_noise_informs_of_nothing():
+    """R² is of held-out data: trees know their own noise by heart."""
+    scores, share = score(uniform_factors(4, seed=1), uniform_factors())
+    assert scores["informativeness"] == share.max() < 0.02 and scores["mig"] < 0.05
+
+
+def check_duplicated_factor_lowers_completeness_and_mig():
+    """Two codes of one factor: each has one factor still, but the factor has two."""
+    factors = uniform_factors()
+    alone, _ = score(factors, factors)
+    noisy = factors + 0.05 * uniform_factors(seed=2), factors + 0.05 * uniform_factors(seed=3)
+    twice, _ = score(np.hstack(noisy), factors)
+    assert twice["disentanglement"] > 0.9 and twice["informativeness"] > 0.9
+    assert twice["completeness"] < alone["completeness"] - 0.2
+    assert twice["mig"] < 0.1 < 0.9 < alone["mig"]
+
+
+def check_one_code_of_two_factors_is_not_disentangled():
+    """Two factors in one code: complete, as each factor has one code, but not disentangled."""
+    factors = uniform_factors(3)
+    code = np.round(factors[:, :1] * 8) + factors[:, 1:2] * 0.4  # before and after the point
+    scores, _ = score(np.hstack([code, factors[:, 2:]]), factors)
+    assert scores["completeness"] > 0.8 > 0.75 > scores["disentanglement"]
+
+
+METRICS = (check_permuted_factors_are_disentangled, check_rotated_factors_are_entangled,
+           check_noise_informs_of_nothing, check_duplicated_factor_lowers_completeness_and_mig,
+           check_one_code_of_two_factors_is_not_disentangled)
+
+
+@pytest.mark.parametrize("check", METRICS, ids=lambda check: check.__name__.removeprefix("check_"))
+def test_dci_and_mig_of_codes_whose_scores_are_known(check):
+    """Eastwood & Williams (2018), Chen et al. (2018)."""
+    check()
+
+
+def test_constant_and_single_latents_have_scores():
+    """A latent that β has switched off, or --z-dim 1, must not give NaN."""
+    factors = uniform_factors(2)
+    for codes in (np.zeros_like(factors), factors[:, :1]):
+        scores, share = score(codes, factors)
+        assert np.isfinite([*scores.values()]).all() and np.isfinite(share).all()
+
+
+@pytest.fixture
+def few_frames(monkeypatch):
+    """Labelled sets of seconds."""
+    monkeypatch.setattr(diswm, "FRAMES", 100)
+    monkeypatch.setattr(diswm, "DECISIONS", 20)
+
+
+def test_labelled_frames_know_the_colors_and_joints_that_they_show(few_frames):
+    """A label one frame off would call any encoder entangled; check it against the pixels."""
+    cfg = tiny_config(dst="cartpole_swingup")
+    images, factors, names = diswm.labelled_frames(cfg)
+    assert images.shape == (100, 64, 64, 3) and factors.shape == (100, len(names))
+    assert {"floor colour (red)", "body colour (blue)", "slider", "hinge_1"} <= {*names}
+    floor = images[:, 56:].mean((1, 2))                                       # below the cart
+    for channel, color in enumerate(("red", "green", "blue")):
+        label = factors[:, names.index(f"floor colour ({color})")]
+        assert np.corrcoef(floor[:, channel], label)[0, 1] > 0.9
+    colors = factors[:, [" colour " in name for name in names]]
+    low, high = np.array(diswm.COLOR_CENTERS["train"]), np.array(diswm.COLOR_CENTERS["shifted"])
+    low, high = np.minimum(low, high) - 0.2, np.maximum(low, high) + 0.2
+    found = colors.reshape(100, -1, 3)
+    assert (low - 1e-6 <= found).all() and (found <= high + 1e-6).all()
+    assert len(np.unique(colors, axis=0)) == 100                              # each frame anew
+    assert np.ptp(found, 0).min() > 0.3
+    off_diagonal = np.corrcoef(colors.T)[~np.eye(colors.shape[1], dtype=bool)]
+    assert np.abs(off_diagonal).max() < 0.5                                   # each by itself
+    assert np.abs(factors[:, names.index("hinge_1")]).max() <= np.pi
+
+
+def test_materials_that_do_not_show_are_no_factors(few_frames):
+    """finger_spin has a target that is hidden: no latent can know its colour."""
+    _, factors, names = diswm.labelled_frames(tiny_config(dst="finger_spin"))
+    assert {name.split(" colour ")[0] for name in names if " colour " in name} == {
+        "floor", "body", "effector", "decoration"}
+    assert np.ptp(factors, 0).min() > 0
+
+
+def test_start_encoder_is_the_first_checkpoint_bit_for_bit(teacher, tmp_path, monkeypatch):
+    """--metrics builds it anew from the seed; it must be what train_agent began with."""
+    argv = cut_command(teacher, tmp_path)
+    interrupt(diswm.ActionRepeat, "step", 10, argv)
+    folder = next(tmp_path.rglob("checkpoint.pt")).parent
+    saved = torch.load(folder / "checkpoint.pt", weights_only=True)["trainer"]
+    assert saved["progress"] == 0
+    cfg, agent, _ = diswm.load_model(folder, CPU)
+    seen = []
+    monkeypatch.setattr(diswm, "labelled_frames", lambda cfg: (
+        np.zeros((8, 64, 64, 3), np.uint8), uniform_factors(2, 8), ["a", "b"]))
+    monkeypatch.setattr(diswm.BetaVAEEncoder, "forward", lambda self, image: (
+        seen.append(self) or torch.zeros(len(image), 20), None))
+    torch.manual_seed(1234)
+    diswm.measure(cfg, agent.model, agent.teacher, tmp_path / "out.json")
+    taught, start, end = seen
+    assert (taught, end) == (agent.teacher, agent.model.encoder) and start is not end
+    assert same(start, {key.removeprefix("encoder."): value for key, value
+                        in saved["agent"]["model"].items() if key.startswith("encoder.")})
+
+
+def test_traverse_measures_disentanglement_and_labels_the_picture(
+        finished, teacher, few_frames, monkeypatch):
+    """Real DMC: JSON of all encoders; rows by nats, each with the factor that it follows most."""
+    drawn, draw = {}, diswm.draw_grid
+    monkeypatch.setattr(diswm, "draw_grid", lambda pictures, rows, columns, path, title="": (
+        drawn.update({path.name: rows}) or draw(pictures, rows, columns, path, title)))
+    for folder, names in ((finished, ["teacher", "start", "end"]), (teacher.parent,
+                                                                    ["start", "end"])):
+        out = succeed("traverse", "--run", folder, "--metrics")
+        result = json.loads((folder / "disentanglement.json").read_text())
+        assert [*result] == ["task", "factors", *names]
+        assert result["task"] == ("walker_walk" if folder == finished else "cheetah_run")
+        share = np.array(result["end"]["share"])
+        assert share.shape == (len(result["factors"]), 20)
+        assert share.sum() / len(share) == pytest.approx(result["end"]["informativeness"], abs=0.01)
+        assert all(f"{name} " in out for name in names) and "mig 0." in out
+        rows = [row.split("  ") for row in drawn["traversal.png"]]
+        nats = [float(row[1].removesuffix(" nats")) for row in rows]
+        assert nats == sorted(nats, reverse=True)
+        for latent, _, follows in rows:
+            best = share[:, int(latent[1:])]
+            assert follows == f"{result['factors'][best.argmax()]} {best.max():.2f}"
+        check_picture(folder / "traversal.png", low=500)
+
+
+def test_metrics_need_a_beta_vae(tmp_path):
+    """DreamerV2's encoder has no latents of which to ask."""
+    succeed("finetune", "--method", "dreamerv2", "--runs", tmp_path, *DEBUG, "--steps", 60,
+            "--prefill", 60)
+    refuse("traverse", "--metrics", "--run", next(tmp_path.rglob("seed0")), says="--metrics")
 
 
 # === System: one whole pipeline ===================================================================
