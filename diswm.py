@@ -39,6 +39,7 @@ import functools
 import io
 import json
 import math
+import multiprocessing
 import os
 import pickle
 import platform
@@ -941,7 +942,7 @@ def open_videos(folder, cache):
 
 vars(np).setdefault("in1d", np.isin)  # NumPy 2.4 dropped it; dm_control's quadruped calls it
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
-OTHER_TASKS = ("pusher", "drawer_open", "drawer_close")
+OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
 MATERIALS = dict(grid="floor", self="body")  # dm_control's names
@@ -949,8 +950,7 @@ TRAINING, EVALUATION = 0, 1  # streams of episode_seed
 
 def family(task):
     """"dmc", "pusher", "drawer" or "gymnasium": a transfer between two of them crosses domains."""
-    other = task.split("_")[0] if task in OTHER_TASKS else "gymnasium"
-    return "dmc" if task in TASKS else other
+    return OTHER_TASKS.get(task, "dmc" if task in TASKS else "gymnasium")
 
 def check_task(task):
     """Raise UserError with the nearest names unless there is such a task."""
@@ -959,8 +959,8 @@ def check_task(task):
         with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
             import gymnasium_robotics  # noqa: F401  registers its tasks, and prints a notice
     if task not in known and task not in gym.registry:
-        ids = [name for name, spec in gym.registry.items() if "mujoco." in str(spec.entry_point)
-               or "robotics" in str(spec.entry_point)]
+        ids = [name for name, spec in gym.registry.items()
+               if any(part in str(spec.entry_point) for part in ("mujoco.", "robotics"))]
         near = " or ".join(difflib.get_close_matches(task, known + ids)) or "none is similar"
         raise UserError(f"unknown '{task}' ({near}); there are: {', '.join(known)}, and the MuJoCo "
                         "tasks of gymnasium and gymnasium-robotics, like FetchReach-v4", code=2)
@@ -1022,8 +1022,8 @@ def drawer_world(task):
     # Its own benchmark sets a goal from a list; this draws one at each reset, from the seed.
     env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
     # DEVIATION: published from 0.96 above, where half of version 3's drawer is out of sight.
-    env.mujoco_renderer.default_cam_config = dict(
-        distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
+    above = dict(distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
+    env.mujoco_renderer.default_cam_config = above
     return env
 
 def bare_simulator(task):
@@ -1032,11 +1032,12 @@ def bare_simulator(task):
         return DMControlEnv(*TASKS[task]), 1000
     if family(task) == "drawer":
         return drawer_world(task), 200
-    above = dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2))  # published
-    name, view = (task, {}) if task != "pusher" else (
-        "Pusher-v5", dict(default_camera_config=above))
-    env = gym.make(name, disable_env_checker=True, max_episode_steps=-1, **view)
-    return env.unwrapped, gym.spec(name).max_episode_steps
+    name = "Pusher-v5" if task == "pusher" else task
+    env = gym.make(name, disable_env_checker=True, max_episode_steps=-1).unwrapped
+    if task == "pusher":                                                      # published
+        above = dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2))
+        env.mujoco_renderer.default_cam_config = above
+    return env, gym.spec(name).max_episode_steps
 
 class ActionRepeat(gym.Wrapper):
     """Hold an action for n simulator steps, sum the rewards; info["env_steps"] counts the steps.
@@ -1097,8 +1098,7 @@ class ColorDistractor(gym.Wrapper):
         self.half_range, self.step_std = half_range, step_std
         self.groups = color_groups(task, self.unwrapped.model)
         self.original = [array[rows, :3] for _, array, rows in self.groups]   # copies
-        # The first group of the Pusher, the object, is black (published).
-        self.tint = np.arange(len(self.groups))[:, None] >= (task == "pusher")
+        self.tint = np.arange(len(self.groups))[:, None] >= (task == "pusher")  # black: its object
         self.rng = np.random.default_rng()
 
     def paint(self, colors):
@@ -1135,13 +1135,13 @@ class Pixels(gym.ObservationWrapper):
     def __init__(self, env, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
-        task, model, self.camera = self.unwrapped, self.unwrapped.model, "track"
-        if isinstance(task, DMControlEnv):
-            self.camera = 0
-        elif mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track") < 0:  # gymnasium's rule
+        model, self.camera = self.unwrapped.model, 0
+        if not isinstance(self.unwrapped, DMControlEnv):                      # gymnasium's rule
+            self.camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+        if self.camera < 0:
             self.camera = mujoco.MjvCamera()
             mujoco.mjv_defaultFreeCamera(model, self.camera)
-            library = getattr(task, "mujoco_renderer", None)
+            library = getattr(self.unwrapped, "mujoco_renderer", None)
             for key, value in (getattr(library, "default_cam_config", None) or {}).items():
                 setattr(self.camera, key, value)
         quality = model.vis.quality
@@ -1219,6 +1219,8 @@ if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its la
 
 def config_env(cfg, task, phase, **kwargs):
     """make_env with the values of a Config."""
+    if multiprocessing.parent_process():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)                          # one takes Ctrl-C
     return make_env(task, phase=phase, action_repeat=cfg.action_repeat, time_limit=cfg.time_limit,
                     colors=cfg.colors, color_range=cfg.color_range, fast_render=cfg.fast_render,
                     color_step_std=cfg.color_step_std, **kwargs)
@@ -1228,7 +1230,11 @@ def config_envs(cfg, task, **kwargs):
     make = [functools.partial(config_env, cfg, task, "train", **kwargs)] * cfg.envs
     if cfg.envs == 1:
         return gym.vector.SyncVectorEnv(make)
-    return gym.vector.AsyncVectorEnv(make, context="spawn")                   # EGL hangs in a fork
+    try:
+        return gym.vector.AsyncVectorEnv(make, context="spawn")               # EGL hangs in a fork
+    except (EOFError, ConnectionError) as error:
+        raise UserError("the processes of --envs did not start; in a script of your own, call this "
+                        "under: if __name__ == '__main__'") from error
 
 def padded_actions(cfg, action_dim):
     """Actions of a world model: the more of both tasks' where it carries weights over (paper)."""
@@ -1242,26 +1248,25 @@ def episode_seed(seed, stream, index):
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
 
 def play_episodes(envs, policy, seeds, phase, each=None):
-    """Play an episode in each environment → their [(rows (see make_row), return, success), …].
+    """Play an episode in each environment → [(rows (see make_row), return, success), …].
     policy(images, actions, state) → (actions, state), given the previous actions and, at first,
-    None. each(env_steps), an entry for each environment still playing, is called after each
-    decision; all are cut where it returns true. Success is None where the task does not tell."""
+    None. each(env_steps), of those that still play, is called after each decision; where it
+    returns true, all are cut. Success is None where the task does not tell."""
     images, _ = envs.reset(seed=seeds, options=dict(phase=phase))
     actions, state = np.zeros(envs.action_space.shape, np.float32), None
     episodes = [[make_row(*pair, first=True)] for pair in zip(images, actions, strict=True)]
-    playing, success = np.full(len(episodes), True), [None] * len(episodes)
+    playing, success = np.full(len(seeds), True), [None] * len(seeds)
     while playing.any():
         actions, state = policy(images, actions, state)
         images, rewards, terminated, truncated, info = envs.step(actions)
         for i in np.flatnonzero(playing):                                     # the rest start anew
-            row = make_row(images[i], actions[i], float(rewards[i]), bool(terminated[i]))
-            episodes[i].append(row)
+            episodes[i].append(make_row(images[i], actions[i], rewards[i], bool(terminated[i])))
             if "success" in info:
                 success[i] = bool(success[i] or info["success"][i])
         cut = bool(each and each(info["env_steps"][playing]))
         playing &= ~(terminated | truncated | cut)
-    return [(rows, math.fsum(row["reward"] for row in rows), reached)
-            for rows, reached in zip(episodes, success, strict=True)]
+    returns = [math.fsum(row["reward"] for row in rows) for rows in episodes]
+    return list(zip(episodes, returns, success, strict=True))
 
 def random_policy(seeds):
     """Uniform actions in [−1, 1], from a stream for each environment."""
@@ -1550,23 +1555,22 @@ class AgentTrainer(Trainer):
         return super().state_dict() | dict(teacher=teacher, action_dim=self.agent.action_dim)
 
 def evaluate_agent(cfg, agent, envs, phase, replay=None):
-    """Play `eval_episodes` episodes, the same seeds every time; agent None: random actions.
-    Adds them to the replay. Returns mean, list and standard deviation of their returns, and the
-    share that succeeded where the task tells. Training's random numbers stay untouched."""
-    returns, successes, count = [], [], envs.num_envs
+    """Play `eval_episodes` episodes into the replay, the same seeds every time; agent None: random.
+    Returns mean, list and standard deviation of their returns and, where the task tells, the share
+    that succeeded. Training's random numbers stay untouched."""
+    played, count = [], envs.num_envs
     with torch.random.fork_rng():
         torch.manual_seed(cfg.seed)
         for first in range(0, cfg.eval_episodes, count):
             seeds = [episode_seed(cfg.seed, EVALUATION, first + i) for i in range(count)]
             policy = agent_policy(agent, explore=False) if agent else random_policy(seeds)
-            episodes = play_episodes(envs, policy, seeds, phase)
-            for rows, total, success in episodes[:cfg.eval_episodes - first]:
-                returns.append(total)
-                successes.append(success)
-                if replay:
-                    replay.add(rows)
+            episodes = play_episodes(envs, policy, seeds, phase)[:cfg.eval_episodes - first]
+            played += [result for _, *result in episodes]
+            for rows, *_ in episodes if replay else ():
+                replay.add(rows)
+    returns, success = ([*column] for column in zip(*played, strict=True))
     result = dict(mean=statistics.fmean(returns), returns=returns, std=statistics.pstdev(returns))
-    return result if None in successes else result | dict(success=statistics.fmean(successes))
+    return result if None in success else result | dict(success=statistics.fmean(success))
 
 # === Stages =======================================================================================
 
