@@ -1462,14 +1462,14 @@ def disentanglement(codes, factors):
     `informativeness`. Returns a dict of scores, and each latent's share of each R², (K, Z)."""
     from scipy.stats import entropy  # slow to import
     from sklearn.ensemble import GradientBoostingRegressor
-    from sklearn.metrics import mutual_info_score
     n, importance, r2, information = len(codes) * 3 // 4, [], [], []
     for factor in factors.T:
         trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
         importance.append(trees.feature_importances_ + 1e-12)
         r2.append([max(0.0, trees.score(codes[n:], factor[n:]))])
         tables = [np.histogram2d(factor, code, 20)[0] for code in codes.T]
-        shared = [mutual_info_score(None, None, contingency=table) for table in tables]
+        # I(z; f) / H(f), less 1, which the gap between the two best does not see.
+        shared = [entropy(table.sum(0)) - entropy(table.ravel()) for table in tables]
         information.append(np.sort(shared) / entropy(tables[0].sum(1)))
     of_latents = 1 - entropy(importance, base=max(2, factors.shape[1]), axis=0)       # (Z,)
     of_factors = 1 - entropy(importance, base=max(2, codes.shape[1]), axis=1)         # (K,)
@@ -1509,8 +1509,7 @@ def draw_grid(pictures, rows, columns, path, title=""):
     print(f"wrote {path}")
 
 def traverse(folder, device, metrics=False):
-    """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder.
-    metrics: also write disentanglement.json, and name what each latent of the picture follows."""
+    """Draw traversal.png (of β-VAE latents) and open_loop.png in a run's folder, and `measure`."""
     folder = Path(folder)
     cfg, model, trainer = load_model(folder, device)
     online = isinstance(model, Agent)
@@ -1749,10 +1748,9 @@ def run_command(argv):
     cfg, command = prepare_machine(cfg), globals()[args.command]
     if command in (collect, pretrain, finetune):
         command(cfg, args.fresh)
-    elif command is evaluate:
-        evaluate(args.run, torch.device(cfg.device))
-    elif command is traverse:
-        traverse(args.run, torch.device(cfg.device), args.metrics)
+    elif command in (evaluate, traverse):
+        more = dict(metrics=args.metrics) if command is traverse else {}
+        command(args.run, torch.device(cfg.device), **more)
     elif command is plot:
         runs = Path(cfg.runs)
         plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")
