@@ -2044,13 +2044,13 @@ def test_one_seed_has_no_interval():
 
 def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
     """area: trapezia by the steps between first and last; unequal gaps must count as such."""
-    runs = [{10: 0.0, 20: 10.0, 40: 20.0, 50: 30.0}, {10: 2.0, 20: 12.0, 40: 22.0, 50: 32.0}]
+    runs = [{10: 0.0, 20: 10.0, 40: 20.0, 50: 60.0}, {10: 2.0, 20: 12.0, 40: 22.0, 50: 62.0}]
     found = diswm.curve_figures(runs, switch=25)
-    assert found["area"][0] == pytest.approx((5 * 10 + 15 * 20 + 25 * 10) / 40 + 1)
-    assert found["final"][0] == pytest.approx(21.0)
+    assert found["area"][0] == pytest.approx((5 * 10 + 15 * 20 + 40 * 10) / 40 + 1)
+    assert found["final"][0] == pytest.approx(31.0)
     assert (found["before"][0], found["after"][0]) == (11.0, 21.0)
     at_evaluation = diswm.curve_figures(runs, switch=40)  # evaluated in the old colours still
-    assert (at_evaluation["before"][0], at_evaluation["after"][0]) == (21.0, 31.0)
+    assert (at_evaluation["before"][0], at_evaluation["after"][0]) == (21.0, 61.0)
     assert "before" not in diswm.curve_figures(runs) | diswm.curve_figures(runs, switch=50)
 
 
@@ -2096,7 +2096,7 @@ def check_permuted_factors_are_disentangled():
     factors = uniform_factors()
     noise = uniform_factors(2, seed=1)
     scores, share = score(np.hstack([factors[:, [2, 0, 1]] * [-9, 0.1, 1], noise]), factors)
-    assert min(scores.values()) > 0.9
+    assert 0.9 < min(scores.values()) <= max(scores.values()) <= 1
     assert share.argmax(1).tolist() == [1, 2, 0] and share[:, 3:].max() < 0.02
 
 
@@ -2176,7 +2176,7 @@ def test_labelled_frames_know_the_colors_and_joints_that_they_show(few_frames):
     found = colors.reshape(100, -1, 3)
     assert (low - 1e-6 <= found).all() and (found <= high + 1e-6).all()
     assert len(np.unique(colors, axis=0)) == 100                              # each frame anew
-    assert np.ptp(found, 0).min() > 0.3
+    assert np.ptp(found, 0).min() > 0.45                                      # of both phases
     off_diagonal = np.corrcoef(colors.T)[~np.eye(colors.shape[1], dtype=bool)]
     assert np.abs(off_diagonal).max() < 0.5                                   # each by itself
     assert np.abs(factors[:, names.index("hinge_1")]).max() <= np.pi
@@ -2448,7 +2448,7 @@ def readme_commands():
 
 
 @pytest.mark.skipif(not README.exists(), reason="no README.md beside diswm.py")
-def test_every_readme_command_runs(empty):
+def test_every_readme_command_runs(empty, few_frames):
     """In file order, in one folder, at debug size (also where the README gives a longer one)."""
     commands = readme_commands()
     assert len(commands) >= 5
