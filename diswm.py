@@ -1759,7 +1759,7 @@ def labelled_frames(cfg):
     images, factors, rng = [], [], np.random.default_rng(cfg.seed)
     with contextlib.closing(config_env(replace(cfg, color_step_std=0.0), cfg.dst, "none")) as env:
         model, data, painter = env.unwrapped.model, env.unwrapped.data, env.env
-        original = np.array([array[rows[0], :3] for _, array, rows in painter.groups])
+        original = np.array([rgb[0] for rgb in painter.original]).reshape(-1, 3)
         boxes = [color_box(phase, original, cfg.colors, cfg.color_range) for phase in PHASES[:2]]
         def rendered(group, value):
             painter.paint(np.where(np.arange(len(original))[:, None] == group, value, original))
