@@ -50,6 +50,7 @@ import signal
 import statistics
 import struct
 import sys
+import tempfile
 import time
 import timeit
 import tokenize
@@ -58,6 +59,7 @@ import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 os.environ.setdefault("MUJOCO_GL", "egl")  # unset on a headless machine, MuJoCo picks GLFW and dies
 
 import gymnasium as gym
@@ -303,7 +305,7 @@ def normal_entropy(std):
 def stack(layer, sizes, shapes):
     """Layers from size to size, each with ELU behind; shapes: (kernel, stride, padding) of each."""
     return [part for n, m, shape in zip(sizes[:-1], sizes[1:], shapes, strict=True)
-            for part in (layer(n, m, *shape), nn.ELU())]
+            for part in (layer(n, m, *shape), nn.ELU(inplace=True))]
 
 def mlp(inputs, units, layers, outputs):
     """`layers` hidden layers with ELU, then a linear one."""
@@ -507,6 +509,7 @@ class VideoPredictor(nn.Module):
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
         self.rssm = rssm(action_dim, self.encoder.embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
+        self.to(memory_format=torch.channels_last)
 
     def encode(self, image):
         """image (..., 3, 64, 64) → (embed, code).
@@ -1948,16 +1951,29 @@ def plot(folders, path):
 
 # === Doctor and bench =============================================================================
 
+def machine(cfg):
+    """What runs here, and on what."""
+    versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
+    return dict(device=cfg.device, precision=cfg.precision, threads=torch.get_num_threads(),
+                gl=os.environ["MUJOCO_GL"], versions=dict(python=platform.python_version()) | versions)
+
+def show(result):
+    """Print a dict of dicts, a line for each value."""
+    for name, value in result.items():
+        for part, number in value.items() if isinstance(value, dict) else [("", value)]:
+            print(f"{name + ' ' + part:30}", f"{number:.4g}" if type(number) is float else number)
+
+def family_tasks(cfg):
+    """A task of each family."""
+    dmc = cfg.dst if cfg.dst in TASKS else "walker_walk"
+    return dmc, "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5"
+
 def doctor(cfg):
     """Print versions and device; render a frame of each family of tasks in each phase, doctor.png.
     Raises UserError, once all have been tried, where one does not render."""
-    print(f"python {platform.python_version()}  torch {torch.__version__}  mujoco "
-          f"{mujoco.__version__}  gymnasium {gym.__version__}\n{cfg.device}, {cfg.precision}, "
-          f"{torch.get_num_threads()} threads, MUJOCO_GL={os.environ['MUJOCO_GL']}")
-    tasks = [cfg.dst if cfg.dst in TASKS else "walker_walk", "pusher", "drawer_open",
-             "FetchReach-v4", "HalfCheetah-v5"]
+    show(machine(cfg))
     rows, failed = [], []
-    for task in tasks:
+    for task in family_tasks(cfg):
         try:
             with contextlib.closing(config_env(cfg, task, "none")) as env:
                 rows.append([env.reset(seed=cfg.seed, options=dict(phase=phase))[0]
@@ -1967,13 +1983,13 @@ def doctor(cfg):
             failed.append(task)
             rows.append([np.full((64, 64, 3), 128, np.uint8)] * len(PHASES))
     Path(cfg.runs).mkdir(parents=True, exist_ok=True)
-    draw_grid(np.array(rows), tasks, PHASES, Path(cfg.runs) / "doctor.png")
+    draw_grid(np.array(rows), family_tasks(cfg), PHASES, Path(cfg.runs) / "doctor.png")
     if failed:
         raise UserError(f"{', '.join(failed)} cannot be rendered; the causes stand above")
 
-def median_ms(function, repeats=5):
+def median_s(function, repeats):
     """Median wall time of a call, after one to warm up."""
-    return 1e3 * statistics.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
+    return statistics.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
 
 def parameter_counts(agent):
     """Numbers of parameters by part, and in total."""
@@ -1982,29 +1998,47 @@ def parameter_counts(agent):
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
     return counts | dict(total=sum(counts.values()))
 
-def bench(cfg):
-    """Count parameters; time an update, a pretraining update, a frame and a decision."""
-    device, rng = torch.device(cfg.device), np.random.default_rng(0)
-    shape = cfg.batch_size, cfg.batch_length
-    teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
-    with contextlib.closing(config_env(cfg, cfg.dst, "train")) as env:
-        agent = Agent(cfg, env.action_space.shape[0], device, teacher)
-        policy, image = agent_policy(agent, explore=True), env.render()[None]
-        zeros = np.zeros((1, agent.action_dim), np.float32)
-        times = dict(frame=median_ms(env.render, 50),
-                     decision=median_ms(lambda: env.step(policy(image, zeros, None)[0][0]), 50))
-    videos = dict(image=rng.integers(0, 256, (*shape, 64, 64, 3), np.uint8),
-                  is_first=np.zeros(shape, bool))
-    batch = videos | {key: np.ones(shape, np.float32) for key in ("reward", "discount")}
-    batch["action"] = rng.uniform(-1, 1, (*shape, agent.action_dim)).astype(np.float32)
-    times["pretrain step"] = median_ms(lambda: VideoTrainer(cfg, None, device).update(videos))
-    times["train step"] = median_ms(lambda: agent.update(batch, cfg.eta, 1))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{cfg.dst}, batch {shape[0]} × {shape[1]}, {cfg.device}, {cfg.precision}, "
-          f"{torch.get_num_threads()} threads",
-          *(f"{name:14}{count:>11,} parameters" for name, count in parameter_counts(agent).items()),
-          *(f"{name:14}{value:>11.1f} ms" for name, value in times.items()),
-          f"{'peak memory':14}{peak:>11.0f} MiB", sep="\n  ")
+def bench(cfg, repeats=5, scaling=False):
+    """Time an update, a pretraining update, the drawing of a batch; in each family of tasks a frame
+    and a decision. Count parameters. scaling: also time the update at four batch sizes and four
+    horizons, and fit the exponent of its growth. Returns a dict of names with units."""
+    device, rng, result = torch.device(cfg.device), np.random.default_rng(0), machine(cfg)
+    result |= {name: getattr(cfg, name) for name in ("method", "batch_size", "batch_length")}
+    def agent_for(cfg, actions):
+        teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
+        return Agent(cfg, actions, device, teacher)
+    with contextlib.closing(config_env(cfg, cfg.dst, "none", pixels=False)) as env:
+        actions = env.action_space.shape[0]
+    with tempfile.TemporaryDirectory() as folder:
+        replay = Replay(folder)
+        replay.add([make_row(rng.integers(0, 256, (64, 64, 3), np.uint8), rng.uniform(-1, 1, actions))
+                    for _ in range(max(1000, cfg.batch_length))])
+        def batch(cfg):
+            return replay.sample(cfg.batch_size, cfg.batch_length, rng)
+        def step_s(cfg):
+            agent, data = agent_for(cfg, actions), batch(cfg)
+            return median_s(lambda: mean_metrics([agent.update(data, cfg.eta, 1)]), repeats)
+        result |= dict(train_step_s=step_s(cfg), sample_ms=1e3 * median_s(lambda: batch(cfg), 20))
+        videos, data = VideoTrainer(cfg, None, device), batch(cfg)
+        result["pretrain_step_s"] = median_s(lambda: mean_metrics([videos.update(data)]), repeats)
+        result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        for name in ("batch_size", "horizon") if scaling else ():
+            values = [math.ceil(getattr(cfg, name) * part / 4) for part in (1, 2, 3, 4)]
+            times = [step_s(replace(cfg, **{name: value})) for value in values]
+            exponent = float(np.polyfit(np.log(values), np.log(times), 1)[0])
+            result[f"{name}_scaling"] = dict(zip(map(str, values), times, strict=True)) | dict(
+                exponent=exponent)
+    result["params"] = parameter_counts(agent_for(cfg, actions))
+    result |= dict(frame_ms={}, decision_ms={})
+    for task in family_tasks(cfg):
+        with contextlib.closing(config_env(cfg, task, "train")) as env:
+            agent = agent_for(cfg, env.action_space.shape[0])
+            zeros, image = np.zeros((1, agent.action_dim), np.float32), env.render()[None]
+            def decide():
+                env.step(agent.act(image, zeros, None, True)[0][0])
+            result["frame_ms"][task] = 1e3 * median_s(env.render, 50)
+            result["decision_ms"][task] = 1e3 * median_s(decide, 50)
+    return result
 
 # === Command line =================================================================================
 
@@ -2049,6 +2083,10 @@ def parse_args(argv):
             sub.add_argument("--run", required=True, help="folder of a run: runs/…/seed0")
         if name == "traverse":
             sub.add_argument("--metrics", action="store_true", help="also measure disentanglement")
+        if name == "bench":
+            sub.add_argument("--json", action="store_true", help="print one JSON object")
+            sub.add_argument("--scaling", action="store_true", help="also how the update's cost grows")
+            sub.add_argument("--repeats", type=int, default=5, help="updates to take the median of")
         if name == "plot":
             sub.add_argument("run", nargs="*", help="folders of runs; default: all finetune runs")
             sub.add_argument("--out", help="PNG to write; default: curves.png in --runs")
@@ -2097,6 +2135,12 @@ def run_command(argv):
     elif command is plot:
         runs = Path(cfg.runs)
         plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")
+    elif command is bench:
+        result = bench(cfg, max(1, args.repeats), args.scaling)
+        if args.json:
+            print(json.dumps(result))
+        else:
+            show(result)
     else:
         command(cfg)
 
