@@ -670,8 +670,8 @@ class Adam(torch.optim.Adam):
     def load_state_dict(self, state):
         """The moments; the rest is the Config's. Torch itself would take another model's."""
         super().load_state_dict(dict(state, param_groups=self.state_dict()["param_groups"]))
-        for p in self.param_groups[0]["params"] if self.state else ():
-            if [x.shape for x in self.state[p].values()] != [(), p.shape, p.shape]:
+        for p, moments in self.state.items():
+            if [x.shape for x in moments.values()] != [(), p.shape, p.shape]:
                 raise ValueError("the optimiser's moments are another model's")
 
 def autocast(cfg):

@@ -1916,7 +1916,7 @@ def test_pipeline_of_methods_that_carry_weights_over(carried):
     assert "distill" not in values and np.isfinite(values["reward"])
     succeed("evaluate", "--run", folder)
     for run in (folder, video.parent):
-        succeed("traverse", "--run", run)
+        succeed("traverse", "--run", run, "--videos", folder / "episodes")
         check_picture(run / "open_loop.png")
     assert "world_model" in succeed("bench", "--method", method, *DEBUG)
 
