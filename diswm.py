@@ -1849,6 +1849,7 @@ def traverse(folder, device, videos="", metrics=False):
     place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
     replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
     teacher, model = (model.teacher, model.model) if online else (None, model)
+    cfg = cfg if online else replace(cfg, dst=cfg.src)                        # also of old runs
     if metrics and cfg.encoder != "beta_vae":
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
