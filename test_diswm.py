@@ -2880,6 +2880,41 @@ def test_log_shorter_than_its_checkpoint_says_is_refused(finished, tmp_path):
     succeed(*argv)
 
 
+@slow
+def test_ctrl_c_with_several_envs_ends_all_processes_without_a_traceback(tmp_path):
+    """A terminal sends it to the whole group; the processes of --envs leave it to the first."""
+    argv = ("finetune", "--dst", "pusher", "--method", "dreamerv2", "--runs", tmp_path, "--envs", 2,
+            *DEBUG, "--steps", 10**6, "--prefill", 10**6)
+    process = subprocess.Popen([sys.executable, diswm.__file__, *map(str, argv)], text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                               start_new_session=True)
+    while "1,000,000" not in process.stdout.readline():
+        assert process.poll() is None
+    time.sleep(1)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in err and "interrupted" in err
+    with pytest.raises(ProcessLookupError):  # soon nobody is left
+        for _ in range(100):
+            os.killpg(process.pid, 0)
+            time.sleep(0.1)
+
+
+@slow
+def test_several_envs_in_an_unguarded_script_say_what_is_missing(tmp_path):
+    """spawn imports the script again in each process, which then starts anew."""
+    script = tmp_path / "user.py"
+    script.write_text(f"""
+import sys
+sys.path.insert(0, {str(Path(diswm.__file__).parent)!r})
+import diswm
+diswm.main(["finetune", "--dst", "pusher", "--method", "dreamerv2", "--envs", "2",
+            "--runs", {str(tmp_path)!r}, *{DEBUG!r}])
+""")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120)
+    assert done.stderr.strip().splitlines()[-1].startswith("error: ") and "__main__" in done.stderr
+
+
 # === System: bad input ============================================================================
 
 @pytest.mark.parametrize("argv, says", [
