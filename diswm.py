@@ -125,13 +125,13 @@ class Config:
     encoder: str = flag("beta_vae", "image encoder and decoder; conv: DreamerV2's (paper)",
                         choices=("beta_vae", "conv"))
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1, high=10_000)
-    cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=10_000)
+    cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=1000)
     stoch: int = flag(50, "size of the stochastic state (published)", low=1, high=10_000)
     deter: int = flag(200, "size of the deterministic state (published)", low=1, high=10_000)
     hidden: int = flag(200, "hidden units inside the RSSM (published)", low=1, high=10_000)
     units: int = flag(400, "hidden units of heads and actor-critic (published)", low=1, high=10_000)
-    batch_size: int = flag(50, "windows per batch, B (table)", low=1)
-    batch_length: int = flag(50, "rows per window, T (table)", low=2)
+    batch_size: int = flag(50, "windows per batch, B (table)", low=1, high=10**6)
+    batch_length: int = flag(50, "rows per window, T (table)", low=2, high=10**6)
     model_lr: float = flag(3e-4, "learning rate of video predictor and world model (table)", high=1)
     alpha: float = flag(1.0, "α, weight of the KL in Eq. (5) (table)")
     beta1: float = flag(1.0, "β₁, weight of the action-free KL in Eq. (2) (table)")
@@ -173,7 +173,7 @@ class Config:
             if good and kind in (int, float):
                 good = meta["low"] <= value <= meta["high"]                   # which no NaN is
             if not good or value not in (meta["choices"] or [value]):
-                want = meta["choices"] or f"{kind.__name__}, {meta['low']} to {meta['high']:,}"
+                want = meta["choices"] or f"{kind.__name__} from {meta['low']} to {meta['high']:,}"
                 raise ValueError(f"--{field.name.replace('_', '-').strip('-')} {value}: not {want}")
 
 PRESETS = {
@@ -870,7 +870,8 @@ def open_videos(folder, cache):
                   np.load(path, allow_pickle=False) as episode):
                 image = episode["image"]
             with atomic(cache / path.name) as file:
-                np.savez(file, image=image, is_first=np.arange(len(image)) == 0)
+                np.savez(file, image=np.ascontiguousarray(image),
+                         is_first=np.arange(len(image)) == 0)
     return Replay(cache, keys=VIDEO_KEYS)
 
 # === Environments =================================================================================
