@@ -1181,7 +1181,7 @@ def train(trainer, run):
                 left = tqdm.format_interval((trainer.total - trainer.progress) / row["rate"])
                 print(f"{trainer.progress:,}/{trainer.total:,} {trainer.unit}  {shown}  "
                       f"{row['rate']:.1f} {trainer.unit}/s  ETA {left}", flush=True)
-    if stop and trainer.progress < trainer.total:
+    if stop:
         raise UserError(f"stopped by {signal.Signals(stop[0]).name}, saved at {trainer.progress:,} "
                         f"{trainer.unit}; the same command goes on from there", 128 + stop[0])
     print(f"done: {run.folder}")
@@ -1519,8 +1519,9 @@ def traverse(folder, device, videos=""):
     which may be a stranger's, could name."""
     folder = Path(folder)
     cfg, model, _ = load_model(folder, device)
-    online, collected = isinstance(model, Agent), f"collect/{cfg.src}/*/seed*/episodes"
-    places = [folder / "videos", *(folder / "../../../..").glob(collected)]
+    online, (*_, source, _, _) = isinstance(model, Agent), ("", "", *folder.resolve().parts)
+    places = [folder / "videos",
+              *(folder / "../../../..").glob(f"collect/{source}/*/seed*/episodes")]
     place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
     replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
     model = model.model if online else model
