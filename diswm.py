@@ -133,13 +133,13 @@ class Config:
                            "model, below its RSSM (paper)", choices=("none", "weights", "stack"))
     bonus: float = flag(0.0, "weight of the intrinsic bonus in the reward's target (APV: 0.1)")
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1, high=10_000)
-    cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=10_000)
+    cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=1000)
     stoch: int = flag(50, "size of the stochastic state (published)", low=1, high=10_000)
     deter: int = flag(200, "size of the deterministic state (published)", low=1, high=10_000)
     hidden: int = flag(200, "hidden units inside the RSSM (published)", low=1, high=10_000)
     units: int = flag(400, "hidden units of heads and actor-critic (published)", low=1, high=10_000)
-    batch_size: int = flag(50, "windows per batch, B (table)", low=1)
-    batch_length: int = flag(50, "rows per window, T (table)", low=2)
+    batch_size: int = flag(50, "windows per batch, B (table)", low=1, high=10**6)
+    batch_length: int = flag(50, "rows per window, T (table)", low=2, high=10**6)
     model_lr: float = flag(3e-4, "learning rate of video predictor and world model (table)", high=1)
     alpha: float = flag(1.0, "α, weight of the KL in Eq. (5) (table)")
     beta1: float = flag(1.0, "β₁, weight of the action-free KL in Eq. (2) (table)")
@@ -182,7 +182,7 @@ class Config:
             if good and kind in (int, float):
                 good = meta["low"] <= value <= meta["high"]                   # which no NaN is
             if not good or value not in (meta["choices"] or [value]):
-                want = meta["choices"] or f"{kind.__name__}, {meta['low']} to {meta['high']:,}"
+                want = meta["choices"] or f"{kind.__name__} from {meta['low']} to {meta['high']:,}"
                 raise ValueError(f"--{field.name.replace('_', '-').strip('-')} {value}: not {want}")
 
 PRESETS = {
@@ -673,8 +673,8 @@ class Adam(torch.optim.Adam):
     def load_state_dict(self, state):
         """The moments; the rest is the Config's. Torch itself would take another model's."""
         super().load_state_dict(dict(state, param_groups=self.state_dict()["param_groups"]))
-        for p in self.param_groups[0]["params"] if self.state else ():
-            if [x.shape for x in self.state[p].values()] != [(), p.shape, p.shape]:
+        for p, moments in self.state.items():
+            if [x.shape for x in moments.values()] != [(), p.shape, p.shape]:
                 raise ValueError("the optimiser's moments are another model's")
 
 def autocast(cfg):
@@ -938,7 +938,8 @@ def open_videos(folder, cache):
                   np.load(path, allow_pickle=False) as episode):
                 image = episode["image"]
             with atomic(cache / path.name) as file:
-                np.savez(file, image=image, is_first=np.arange(len(image)) == 0)
+                np.savez(file, image=np.ascontiguousarray(image),
+                         is_first=np.arange(len(image)) == 0)
     return Replay(cache, keys=VIDEO_KEYS)
 
 # === Environments =================================================================================
@@ -1413,7 +1414,7 @@ def train(trainer, run):
                 left = tqdm.format_interval((trainer.total - trainer.progress) / row["rate"])
                 print(f"{trainer.progress:,}/{trainer.total:,} {trainer.unit}  {shown}  "
                       f"{row['rate']:.1f} {trainer.unit}/s  ETA {left}", flush=True)
-    if stop and trainer.progress < trainer.total:
+    if stop:
         raise UserError(f"stopped by {signal.Signals(stop[0]).name}, saved at {trainer.progress:,} "
                         f"{trainer.unit}; the same command goes on from there", 128 + stop[0])
     print(f"done: {run.folder}")
@@ -1847,11 +1848,13 @@ def traverse(folder, device, videos="", metrics=False):
     which may be a stranger's, could name."""
     folder = Path(folder)
     cfg, model, _ = load_model(folder, device)
-    online, collected = isinstance(model, Agent), f"collect/{cfg.src}/*/seed*/episodes"
-    places = [folder / "videos", *(folder / "../../../..").glob(collected)]
+    online, (*_, source, _, _) = isinstance(model, Agent), ("", "", *folder.resolve().parts)
+    places = [folder / "videos",
+              *(folder / "../../../..").glob(f"collect/{source}/*/seed*/episodes")]
     place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
     replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
     teacher, model = (model.teacher, model.model) if online else (None, model)
+    cfg = cfg if online else replace(cfg, dst=cfg.src)                        # also of old runs
     if metrics and cfg.encoder != "beta_vae":
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
