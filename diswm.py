@@ -59,7 +59,7 @@ import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # torch in huge pages: 12 % less memory at 50 × 50
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # huge pages: 12 % less memory at 50 × 50
 os.environ.setdefault("MUJOCO_GL", "egl")  # unset on a headless machine, MuJoCo picks GLFW and dies
 
 import gymnasium as gym
@@ -817,9 +817,8 @@ def npz_layout(path, keys, plain=True):
     The offset of an array that is compressed, or in Fortran's order, is None. Raises UserError
     unless `keys` are arrays as make_row has them, a row for each image uint8 (64, 64, 3); `plain`:
     and have an offset. Nothing is unpacked: a zip bomb is refused by the size that it declares."""
-    layout = {}
-    with (reading(path, f"episode with {', '.join(keys)}", "remove it and run again"),
-          zipfile.ZipFile(path) as archive, open(path, "rb") as file):
+    layout, damage = {}, reading(path, f"episode with {', '.join(keys)}", "remove it")
+    with damage, zipfile.ZipFile(path) as archive, open(path, "rb") as file:
         for info in archive.infolist():
             if info.file_size > max(2**30, 100 * info.compress_size):
                 raise ValueError(f"{info.filename} would unpack to {info.file_size:,} bytes")
@@ -934,8 +933,7 @@ def open_videos(folder, cache):
     cache.mkdir(parents=True, exist_ok=True)
     for path in layouts:
         if not (cache / path.name).exists():
-            with (reading(path, "whole episode", "remove it and run again"),
-                  np.load(path, allow_pickle=False) as episode):
+            with reading(path, "video", "remove it"), np.load(path, allow_pickle=False) as episode:
                 image = episode["image"]
             with atomic(cache / path.name) as file:
                 np.savez(file, image=np.ascontiguousarray(image),
@@ -1386,8 +1384,8 @@ def train(trainer, run):
         run.save(trainer)
     began, first = time.time(), trainer.progress
     bar = tqdm(total=trainer.total, initial=first, unit=f" {trainer.unit}", disable=None)
-    with (run.lock, stop_requests() as stop, bar, contextlib.closing(
-            SummaryWriter(run.folder, purge_step=first + 1)) as writer):
+    with run.lock, stop_requests() as stop, bar, contextlib.closing(
+            SummaryWriter(run.folder, purge_step=first + 1)) as writer:
         while trainer.progress < trainer.total and not stop:
             try:
                 row = trainer.advance()
