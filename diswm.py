@@ -214,8 +214,6 @@ METHODS["apv"] = METHODS["dreamerv2"] | dict(carry_over="stack", bonus=0.1)
 
 # === Maths: pure functions of tensors =============================================================
 
-ACTION_LIMIT = 1 - 1e-6  # actions stay strictly inside (−1, 1)
-
 def gaussian_kl(mean_p, std_p, mean_q, std_q):
     """KL[N(mean_p, std_p²) || N(mean_q, std_q²)] of each dimension, nats: (..., S) → (..., S)."""
     # ln(σ_q / σ_p) + (σ_p² + (μ_p − μ_q)²) / (2 σ_q²) − ½
@@ -232,14 +230,10 @@ def rssm_kl_loss(post, prior, balance=0.8, free_nats=1.0):
         balance · max(mean KL[sg(q) || p], free) + (1 − balance) · max(mean KL[q || sg(p)], free)
     post, prior: dicts of `mean` and `std`, (B, T, S). Returns (loss, value): a scalar and the plain
     KL (B, T), nats. Free nats act on the batch mean, as published: below them it is constant."""
-
-    def kl(q, p):
-        return gaussian_kl(q["mean"], q["std"], p["mean"], p["std"]).sum(-1)
-
-    def sg(dist):  # this side is the target of the other
-        return {"mean": dist["mean"].detach(), "std": dist["std"].detach()}
-    value = kl(post, sg(prior))                                               # (B, T), trains q
-    prior_side = kl(sg(post), prior).mean().clamp(min=free_nats)              # trains p
+    q, p = ((dist["mean"], dist["std"]) for dist in (post, prior))
+    sg_q, sg_p = ([x.detach() for x in side] for side in (q, p))              # the other's target
+    value = gaussian_kl(*q, *sg_p).sum(-1)                                    # (B, T), trains q
+    prior_side = gaussian_kl(*sg_q, *p).sum(-1).mean().clamp(min=free_nats)   # trains p
     return balance * prior_side + (1 - balance) * value.mean().clamp(min=free_nats), value
 
 def distillation_loss(z_disen, z_task):
@@ -288,9 +282,9 @@ def gaussian_sample(mean, std):
     """A reparameterised draw: the gradient reaches mean and std."""
     return mean + std * torch.randn_like(std)
 
-def clip_action(action):
-    """Clip into (−1, 1) with a straight-through gradient: a saturated action can come back."""
-    return action + (action.clamp(-ACTION_LIMIT, ACTION_LIMIT) - action).detach()
+def clip_action(action, limit=1 - 1e-6):
+    """Clip strictly into (−1, 1), gradient straight through: a saturated action can come back."""
+    return action + (action.clamp(-limit, limit) - action).detach()
 
 def normal_log_prob(x, mean, std):
     """ln N(x; mean, std²), summed over the last dimension, nats: (..., A) → (...,)."""
@@ -304,18 +298,24 @@ def normal_entropy(std):
 
 def stack(layer, sizes, shapes):
     """Layers from size to size, each with ELU behind; shapes: (kernel, stride, padding) of each."""
-    # In place, 19 % less memory of a step at 50 × 50.
     return [part for n, m, shape in zip(sizes[:-1], sizes[1:], shapes, strict=True)
-            for part in (layer(n, m, *shape), nn.ELU(inplace=True))]
+            for part in (layer(n, m, *shape), nn.ELU(inplace=True))]  # 19 % less memory at 50 × 50
 
-def mlp(inputs, units, layers, outputs):
-    """`layers` hidden layers with ELU, then a linear one."""
-    hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
-    return nn.Sequential(*hidden, nn.Linear(units, outputs))
+class MLP(nn.Sequential):
+    """`layers` hidden layers with ELU, then a linear one, to a number (...,) or, given `dims`, to
+    a normal's mean and standard deviation in (0.1, 2.1), (..., dims) each. fp32 out."""
 
-def bounded_std(x):
-    """A standard deviation in (0.1, 2.1): 2 σ(x / 2) + 0.1."""
-    return 2 * torch.sigmoid(x / 2) + 0.1
+    def __init__(self, inputs, units, layers, dims=None):
+        hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
+        super().__init__(*hidden, nn.Linear(units, 2 * dims if dims else 1))
+        self.dims = dims
+
+    def forward(self, x):
+        x = super().forward(x).float()
+        if not self.dims:
+            return x.squeeze(-1)
+        mean, std = x.chunk(2, -1)
+        return mean, 2 * torch.sigmoid(std / 2) + 0.1
 
 def kaiming(module):
     """Kaiming-normal weights and zero biases, for the β-VAE only (published)."""
@@ -328,61 +328,57 @@ def preprocess(image):
     return image.movedim(-1, -3).float() / 255 - 0.5
 
 class PerFrame(nn.Module):
-    """`self.net` applied to the last `dims` dimensions; all before them are one batch. fp32 out."""
-    dims = 3
+    """Layers for the last `dims` dimensions; all before them are one batch. fp32 out."""
+
+    def __init__(self, dims, *layers):
+        super().__init__()
+        self.dims, self.net = dims, nn.Sequential(*layers)
 
     def forward(self, x):
-        lead = x.shape[:x.dim() - self.dims]
-        return self.net(x.reshape(-1, *x.shape[len(lead):])).float().unflatten(0, lead)
+        lead, frame = x.shape[:-self.dims], x.shape[-self.dims:]
+        return self.net(x.reshape(-1, *frame)).float().unflatten(0, lead)
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
 
-    def __init__(self, z_dim=20, depth=32):
-        super().__init__()
-        self.embed_dim, d = z_dim, depth
+    def __init__(self, z_dim, d):
         shapes = [(4, 2, 1)] * 4 + [(4,)]                                     # 32, 16, 8, 4, 1
-        convolutions = stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes)
-        self.net = nn.Sequential(*convolutions, nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
+        super().__init__(3, *stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes),
+                         nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
         self.apply(kaiming)
 
     def forward(self, image):
         return super().forward(image).chunk(2, -1)
 
-class BetaVAEDecoder(PerFrame):
-    """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
-    dims = 1
+    def encode(self, image):
+        """→ dict of `embed`, a sample of 𝐳, and the `mean` and `logvar` it came from"""
+        mean, logvar = self(image)
+        return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
 
-    def __init__(self, feat_dim, z_dim=20, depth=32):
-        super().__init__()
-        d = depth
-        self.net = nn.Sequential(
-            nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
-            nn.Unflatten(-1, (8 * d, 1, 1)), *stack(
-                nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], [(4,)] + [(4, 2, 1)] * 3),
-            nn.ConvTranspose2d(d, 3, 4, 2, 1))                                # 4, 8, 16, 32, 64
-        self.apply(kaiming)
+def beta_vae_decoder(feat_dim, z_dim, d):
+    """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
+    shapes = [(4,)] + [(4, 2, 1)] * 3                                         # 4, 8, 16, 32, 64
+    return PerFrame(1, nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
+                    nn.Unflatten(-1, (8 * d, 1, 1)),
+                    *stack(nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], shapes),
+                    nn.ConvTranspose2d(d, 3, 4, 2, 1)).apply(kaiming)
 
 class ConvEncoder(PerFrame):
     """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32·depth)."""
 
-    def __init__(self, depth=32):
-        super().__init__()
-        self.embed_dim, d = 32 * depth, depth                                 # 8·depth of 2 × 2
-        convolutions = stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4)
-        self.net = nn.Sequential(*convolutions, nn.Flatten())
+    def __init__(self, d):
+        super().__init__(3, *stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4),
+                         nn.Flatten())                                        # 8·depth of 2 × 2
 
-class ConvDecoder(PerFrame):
+    def encode(self, image):
+        return dict(embed=self(image))
+
+def conv_decoder(feat_dim, d):
     """DreamerV2's decoder, for the baselines: feat (..., S + D) → (..., 3, 64, 64)."""
-    dims = 1
-
-    def __init__(self, feat_dim, depth=32):
-        super().__init__()
-        d = depth
-        self.net = nn.Sequential(
-            nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)), *stack(
-                nn.ConvTranspose2d, [32 * d, 4 * d, 2 * d, d], [(5, 2), (5, 2), (6, 2)]),
-            nn.ConvTranspose2d(d, 3, 6, 2))                                   # 5, 13, 30, 64
+    shapes = [(5, 2), (5, 2), (6, 2)]                                         # 5, 13, 30, 64
+    return PerFrame(1, nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)),
+                    *stack(nn.ConvTranspose2d, [32 * d, 4 * d, 2 * d, d], shapes),
+                    nn.ConvTranspose2d(d, 3, 6, 2))
 
 class RSSM(nn.Module):
     """Recurrent state-space model, Gaussian; action_dim=0 makes it the action-free one of Eq. (1).
@@ -394,18 +390,17 @@ class RSSM(nn.Module):
         action        0      a that led to o_1     (the paper's a_{t−1})
         reward        0      r that came with o_1
       is_first        1      0                     (forgets h, z *and* the action)
-          post       s_0    s_1
-    """
+          post       s_0    s_1"""
 
     def __init__(self, action_dim, embed_dim, stoch=50, deter=200, hidden=200):
         super().__init__()
-        self.action_dim, self.sizes = action_dim, dict(deter=deter, stoch=stoch, mean=stoch,
-                                                       std=stoch)
+        self.action_dim = action_dim
+        self.sizes = dict(deter=deter, stoch=stoch, mean=stoch, std=stoch)
         self.inputs = nn.Sequential(nn.Linear(stoch + action_dim, hidden), nn.ELU())
         self.gru = nn.Linear(hidden + deter, 3 * deter)
         self.norm = nn.LayerNorm(3 * deter)
-        self.prior_net = mlp(deter, hidden, 1, 2 * stoch)
-        self.post_net = mlp(deter + embed_dim, hidden, 1, 2 * stoch)
+        self.prior_net = MLP(deter, hidden, 1, stoch)
+        self.post_net = MLP(deter + embed_dim, hidden, 1, stoch)
 
     @staticmethod
     def feat(state):
@@ -427,8 +422,7 @@ class RSSM(nn.Module):
 
     def draw(self, net, inputs, deter):
         """A state around h_t: `net`'s distribution, a sample."""
-        mean, std = net(inputs).float().chunk(2, -1)
-        std = bounded_std(std)
+        mean, std = net(inputs)
         return dict(deter=deter, mean=mean, std=std, stoch=gaussian_sample(mean, std))
 
     def prior(self, deter):
@@ -500,42 +494,34 @@ class VideoPredictor(nn.Module):
 
     def __init__(self, cfg, action_dim=0):
         super().__init__()
-        self.cfg, feat_dim = cfg, cfg.stoch + cfg.deter
+        self.cfg, feat_dim, d = cfg, cfg.stoch + cfg.deter, cfg.cnn_depth
         if cfg.encoder == "beta_vae":
-            self.encoder = BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth)
-            self.decoder = BetaVAEDecoder(feat_dim, cfg.z_dim, cfg.cnn_depth)
+            self.encoder, embed_dim = BetaVAEEncoder(cfg.z_dim, d), cfg.z_dim
+            self.decoder = beta_vae_decoder(feat_dim, cfg.z_dim, d)
         else:
-            self.encoder = ConvEncoder(cfg.cnn_depth)
-            self.decoder = ConvDecoder(feat_dim, cfg.cnn_depth)
+            self.encoder, embed_dim = ConvEncoder(d), 32 * d
+            self.decoder = conv_decoder(feat_dim, d)
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
-        self.rssm = rssm(action_dim, self.encoder.embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
+        self.rssm = rssm(action_dim, embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
 
-    def encode(self, image):
-        """image (..., 3, 64, 64) → (embed, code).
-        β-VAE: a sample of 𝐳 (..., Z), and its dict of mean and logvar. DreamerV2's encoder: {}."""
-        if isinstance(self.encoder, BetaVAEEncoder):
-            mean, logvar = self.encoder(image)
-            return gaussian_sample(mean, (logvar / 2).exp()), dict(mean=mean, logvar=logvar)
-        return self.encoder(image), {}
-
     def forward(self, batch):
-        """Filter → dict of embed, code, post, prior, feat."""
-        embed, code = self.encode(batch["image"])
-        post, prior = self.rssm.observe(embed, batch.get("action"), batch["is_first"])
-        return dict(embed=embed, code=code, post=post, prior=prior, feat=self.rssm.feat(post))
+        """Filter → dict of code (of encode), post, prior, feat."""
+        code = self.encoder.encode(batch["image"])
+        post, prior = self.rssm.observe(code["embed"], batch.get("action"), batch["is_first"])
+        return dict(code=code, post=post, prior=prior, feat=self.rssm.feat(post))
 
     def terms(self, out, batch):
         """Loss terms of each step, (B, T), nats, but for the KL."""
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
-        error = squared_error(batch["image"], self.decoder(out["feat"]))
-        terms = dict(image=error.sum((-3, -2, -1)))
-        return terms | (dict(disentangle=beta_vae_kl(**out["code"])) if out["code"] else {})
+        error, code = squared_error(batch["image"], self.decoder(out["feat"])), out["code"]
+        vae = dict(disentangle=beta_vae_kl(code["mean"], code["logvar"])) if "mean" in code else {}
+        return dict(image=error.sum((-3, -2, -1))) | vae
 
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
         teacher: dict of embed, mean, logvar of the same images from the frozen teacher, or None."""
-        cfg, terms = self.cfg, self.terms(out, batch)
+        cfg, code, terms = self.cfg, out["code"], self.terms(out, batch)
         loss, kl = rssm_kl_loss(out["post"], out["prior"], cfg.kl_balance, cfg.free_nats)
         metrics = dict(kl_loss=loss, kl=kl.mean(), eta=torch.tensor(eta),
                        post_entropy=normal_entropy(out["post"]["std"]).mean(),
@@ -545,8 +531,8 @@ class VideoPredictor(nn.Module):
             metrics[name] = term.mean()
             loss = loss + self.scales[name] * metrics[name]
         if teacher is not None:
-            distill = (distillation_loss(teacher["embed"], out["embed"]) if cfg.distill == "softmax"
-                       else gaussian_distillation_loss(teacher, out["code"]))
+            distill = (gaussian_distillation_loss(teacher, code) if cfg.distill == "gaussian"
+                       else distillation_loss(teacher["embed"], code["embed"]))
             loss, metrics["distill"] = loss + eta * distill, distill
         return loss, metrics
 
@@ -557,8 +543,8 @@ class WorldModel(VideoPredictor):
         super().__init__(cfg, action_dim)
         self.scales = dict(image=1.0, kl=cfg.alpha, disentangle=cfg.beta, reward=cfg.reward_scale,
                            discount=cfg.discount_scale)
-        self.reward = mlp(cfg.stoch + cfg.deter, cfg.units, 2, 1)
-        self.discount = mlp(cfg.stoch + cfg.deter, cfg.units, 3, 1)
+        self.reward = MLP(cfg.stoch + cfg.deter, cfg.units, 2)        # r̂, mean of a unit Gaussian
+        self.discount = MLP(cfg.stoch + cfg.deter, cfg.units, 3)                  # the logit of γ̂
         self.bonus = IntrinsicBonus(cfg.stoch + cfg.deter) if cfg.bonus else None
 
     @torch.no_grad()
@@ -569,20 +555,12 @@ class WorldModel(VideoPredictor):
         for weight, value in zip(own.parameters(), video.parameters(), strict=True):
             weight[..., :value.shape[-1]] = value
 
-    def predict_reward(self, feat):
-        """r̂, the mean of a unit Gaussian: (..., S + D) → (...,)"""
-        return self.reward(feat).squeeze(-1).float()
-
-    def predict_discount(self, feat):
-        """The logit of γ̂: (..., S + D) → (...,)"""
-        return self.discount(feat).squeeze(-1).float()
-
     def terms(self, out, batch):
         """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
         feat = out["feat"][:, :batch["reward"].shape[1]]  # the last rows have no intrinsic bonus
-        reward = squared_error(batch["reward"], self.predict_reward(feat))
+        reward = squared_error(batch["reward"], self.reward(feat))
         # DEVIATION: the discount head of Eq. (4) is trained; the published code switches it off.
-        logit, target = self.predict_discount(out["feat"]), self.cfg.gamma * batch["discount"]
+        logit, target = self.discount(out["feat"]), self.cfg.gamma * batch["discount"]
         discount = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
         return super().terms(out, batch) | dict(reward=reward, discount=discount)
 
@@ -594,9 +572,9 @@ class ActorCritic(nn.Module):
     def __init__(self, cfg, action_dim):
         super().__init__()
         self.cfg, feat_dim = cfg, cfg.stoch + cfg.deter
-        self.actor = mlp(feat_dim, cfg.units, 4, 2 * action_dim)
-        self.critic = mlp(feat_dim, cfg.units, 3, 1)
-        self.slow_critic = mlp(feat_dim, cfg.units, 3, 1).requires_grad_(False)   # only copied
+        self.actor = MLP(feat_dim, cfg.units, 4, action_dim)
+        self.critic = MLP(feat_dim, cfg.units, 3)
+        self.slow_critic = MLP(feat_dim, cfg.units, 3).requires_grad_(False)      # only copied
         self.copy_critic()
 
     def copy_critic(self):
@@ -605,12 +583,8 @@ class ActorCritic(nn.Module):
 
     def policy(self, feat):
         """→ mean in (−1, 1) and std of the normal of actions, (..., A)"""
-        mean, std = self.actor(feat).float().chunk(2, -1)
-        return torch.tanh(mean), bounded_std(std)
-
-    def value(self, feat, slow=False):
-        """v(s): (..., S + D) → (...,)"""
-        return (self.slow_critic if slow else self.critic)(feat).squeeze(-1).float()
+        mean, std = self.actor(feat)
+        return torch.tanh(mean), std
 
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
@@ -639,16 +613,16 @@ class ActorCritic(nn.Module):
         which is *not* trained here: take gradients for the actor's own parameters only."""
         cfg = self.cfg
         feats, log_prob, entropy = self.imagine(model, start)
-        reward = model.predict_reward(feats[:-1])                             # (H, N)
-        discount = torch.sigmoid(model.predict_discount(feats[:-1]))
+        reward = model.reward(feats[:-1])                                     # (H, N)
+        discount = torch.sigmoid(model.discount(feats[:-1]))
         discount = torch.cat([start_discount[None], discount[1:]])            # γ_0 is known
-        slow = self.value(feats, slow=True)                                   # (H + 1, N)
+        slow = self.slow_critic(feats)                                        # (H + 1, N)
         # DEVIATION: the published λ-return comes out reversed in time.
         target = lambda_return(reward, slow[:-1], discount, slow[-1], cfg.lambda_)
         # w_t = Π_{i<t} γ_i: how likely the episode still runs. A weight, nothing to optimise.
         weight = torch.cat([torch.ones_like(discount[:1]), discount[:-1]]).cumprod(0).detach()
         regression = target.detach()                                          # sg(V_t)
-        value = self.value(feats[:-1].detach())                               # the model is fixed
+        value = self.critic(feats[:-1].detach())                              # the model is fixed
         critic_loss = (weight * squared_error(regression, value)).mean()
         advantage = regression - value.detach()                               # sg(V_t − v(s_t))
         # ρ V_t + (1 − ρ) ln π(a_t | s_t) sg(V_t − v(s_t)) + scale · H[a_t | s_t]
@@ -717,19 +691,12 @@ class Agent:
         explore: sample the actor, else take its mode. Returns action, numpy (N, A), and state."""
         is_first = torch.full((len(image),), state is None, device=self.device)
         state = self.model.rssm.initial(len(image)) if state is None else state
-        embed, _ = self.model.encode(preprocess(torch.as_tensor(image, device=self.device)))
+        image = preprocess(torch.as_tensor(image, device=self.device))
+        embed = self.model.encoder.encode(image)["embed"]
         action = torch.as_tensor(action, device=self.device)
         state = self.model.rssm.step(state, action, embed, is_first)
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
-
-    def teach(self, image):
-        """What the frozen teacher sees: embed, mean, logvar; or None."""
-        if self.teacher is None:
-            return None
-        with torch.no_grad():                                                 # its knowledge stays
-            mean, logvar = self.teacher(image)
-            return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
 
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
@@ -742,7 +709,8 @@ class Agent:
             bonus = self.model.bonus(out["post"].get("below", out["feat"]))
             batch["reward"] = batch["reward"][:, :bonus.shape[1]] + cfg.bonus * bonus
         with autocast(cfg):
-            loss, metrics = self.model.loss(out, batch, self.teach(batch["image"]), eta)
+            teacher = self.teacher.encode(batch["image"]) if self.teacher else None
+            loss, metrics = self.model.loss(out, batch, teacher, eta)
         if probe and "distill" in metrics:
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
