@@ -1,7 +1,5 @@
-"""DisWM: Disentangled World Models, the whole paper in one file.
-
-    Wang et al., "Disentangled World Models: Learning to Transfer Semantic Knowledge from
-    Distracting Videos for Reinforcement Learning", ICCV 2025. "Eq. (n)" is the paper's equation.
+"""DisWM, the whole paper in one file: Wang et al., "Disentangled World Models: Learning to Transfer
+Semantic Knowledge from Distracting Videos for Reinforcement Learning", ICCV 2025, whose Eq. (n) it is.
 
 Videos of one task whose colours keep changing are enough to learn *which things in a picture vary
 independently*: a β-VAE inside an action-free video predictor finds latents for them. An agent in a
@@ -87,17 +85,15 @@ class UserError(Exception):
 
 # === Config =======================================================================================
 
-def flag(default, help, *, low=0, high=10**12, choices=None, free=False):
+def flag(default, help, choices=None, *, low=0, high=10**12, free=False):
     """A Config field and its flag. low, high: of numbers; free: may change on resuming."""
-    meta = dict(help=help, low=low, high=high, choices=choices, free=free)
-    return dataclasses.field(default=default, metadata=meta)
+    return dataclasses.field(default=default, metadata=locals())
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that can be set; the defaults are the paper's (`--preset paper`).
-    Sources: "table" is the paper's hyperparameter table, "published" the authors' configuration,
-    "ours" a choice of this implementation. An *env step* is one simulator step; a *decision* is one
-    action of the agent, held for `action_repeat` env steps."""
+    """All that can be set; the defaults are the paper's (`--preset paper`). Sources: "table" is its
+    table of hyperparameters, "published" the authors' configuration, "ours" our choice. An *env
+    step* is one of the simulator; a *decision* is an action held for `action_repeat` env steps."""
     # What is run, and where it is kept.
     src: str = flag("cheetah_run", "task of the distracting videos (paper, Fig. 4a)")
     dst: str = flag("walker_walk", "target task (paper, Fig. 4a)")
@@ -110,7 +106,7 @@ class Config:
     action_repeat: int = flag(2, "env steps per decision (published)", low=1)
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
     colors: str = flag("published", "colour boxes around fixed centres, or the original colours "
-                       "(published; paper)", choices=("published", "original"))
+                       "(published; paper)", ("published", "original"))
     color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)", high=1)
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
@@ -127,10 +123,9 @@ class Config:
     eval_episodes: int = flag(10, "episodes per evaluation (published)", low=1)
     replay_capacity: int = flag(1_000_000, "rows kept in the replay (published)", low=1)
     # World model, Eqs. (1), (2), (4), (5).
-    encoder: str = flag("beta_vae", "image encoder and decoder; conv: DreamerV2's (paper)",
-                        choices=("beta_vae", "conv"))
+    encoder: str = flag("beta_vae", "image nets; conv: DreamerV2's (paper)", ("beta_vae", "conv"))
     carry_over: str = flag("none", "where a video predictor's weights go: nowhere, into an agent's "
-                           "model, below its RSSM (paper)", choices=("none", "weights", "stack"))
+                           "model, below its RSSM (paper)", ("none", "weights", "stack"))
     bonus: float = flag(0.0, "weight of the intrinsic bonus in the reward's target (APV: 0.1)")
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1, high=10_000)
     cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=1000)
@@ -151,7 +146,7 @@ class Config:
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
     distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
-                        choices=("softmax", "gaussian"))
+                        ("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
@@ -169,9 +164,9 @@ class Config:
     slow_every: int = flag(100, "updates between copies to the slow critic (published)", low=1)
     grad_clip: float = flag(100.0, "largest gradient norm of each optimiser (published)")
     # Machine.
-    device: str = flag("auto", "where it runs (ours)", choices=("auto", "cpu", "cuda"), free=True)
+    device: str = flag("auto", "where it runs (ours)", ("auto", "cpu", "cuda"), free=True)
     precision: str = flag("auto", "of convolutions and MLPs; auto: bf16 where native (ours)",
-                          choices=("auto", "fp32", "bf16"), free=True)
+                          ("auto", "fp32", "bf16"), free=True)
     threads: int = flag(0, "CPU threads; 0: one per core (ours)", high=1024, free=True)
 
     def __post_init__(self):
@@ -179,8 +174,7 @@ class Config:
         for field in dataclasses.fields(self):
             value, meta, kind = getattr(self, field.name), field.metadata, type(field.default)
             good = type(value) is kind or (kind is float and type(value) is int)
-            if good and kind in (int, float):
-                good = meta["low"] <= value <= meta["high"]                   # which no NaN is
+            good = good and (kind in (str, bool) or meta["low"] <= value <= meta["high"])  # not NaN
             if not good or value not in (meta["choices"] or [value]):
                 want = meta["choices"] or f"{kind.__name__} from {meta['low']} to {meta['high']:,}"
                 raise ValueError(f"--{field.name.replace('_', '-').strip('-')} {value}: not {want}")
@@ -189,28 +183,25 @@ PRESETS = {
     "paper": Config(),
     # The same algorithm for two CPU cores. A batch five times smaller wants a larger model_lr. η's
     # clock shrinks with the run (to a tenth), and η grows by 50 / 32 as Eq. (3) sums over time.
-    "small": Config(
-        steps=100_000, collect_steps=20_000, pretrain_updates=1_000, prefill=1_000,
-        fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, model_lr=1e-3,
-        cnn_depth=16, units=200, eta=0.156, eta_end=0.0156, eta_decay=5_000),
-    # Seconds, for tests: everything happens, nothing is learnt.
-    "debug": Config(
-        steps=300, collect_steps=200, pretrain_updates=20, prefill=50, first_updates=2,
-        train_every=10, eval_every=100, eval_episodes=2, time_limit=50, batch_size=3,
-        batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12, hidden=10, units=10, eta=0.6,
-        eta_end=0.06, eta_decay=60, slow_every=5, threads=1),
+    "small": Config(steps=100_000, collect_steps=20_000, pretrain_updates=1_000, prefill=1_000,
+                    fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
+                    cnn_depth=16, model_lr=1e-3, eta=0.156, eta_end=0.0156, eta_decay=5_000),
+    "debug": Config(  # seconds, for tests: everything happens, nothing is learnt
+        steps=300, collect_steps=200, pretrain_updates=20, prefill=50, first_updates=2, threads=1,
+        train_every=10, eval_every=100, eval_episodes=2, time_limit=50, batch_size=3, horizon=3,
+        batch_length=8, cnn_depth=4, stoch=6, deter=12, hidden=10, units=10, eta=0.6, eta_end=0.06,
+        eta_decay=60, slow_every=5),
 }
 
-# A method is a set of Config values and nothing else: all of them run through the same code.
-METHODS = {
+DV2 = dict(encoder="conv", beta=0.0, beta2=0.0, eta=0.0, eta_end=0.0, carry_over="none", bonus=0.0)
+METHODS = {  # sets of Config values and nothing else: all of them run through the same code
     "diswm": {},
     "no_distill": dict(eta=0.0, eta_end=0.0),        # ablation: no latent distillation
     "no_disentangle": dict(beta=0.0, beta2=0.0),     # ablation: no β in either stage
-    "dreamerv2": dict(encoder="conv", beta=0.0, beta2=0.0, eta=0.0, eta_end=0.0,
-                      carry_over="none", bonus=0.0),
+    "dreamerv2": DV2,
+    "dv2_finetune": DV2 | dict(carry_over="weights"),
+    "apv": DV2 | dict(carry_over="stack", bonus=0.1),
 }
-METHODS["dv2_finetune"] = METHODS["dreamerv2"] | dict(carry_over="weights")
-METHODS["apv"] = METHODS["dreamerv2"] | dict(carry_over="stack", bonus=0.1)
 
 # === Maths: pure functions of tensors =============================================================
 
@@ -222,8 +213,7 @@ def gaussian_kl(mean_p, std_p, mean_q, std_q):
 def beta_vae_kl(mean, logvar):
     """Disentanglement loss of Eqs. (2), (5): KL[N(mean, exp(logvar)) || N(0, I)].
     mean, logvar: (..., Z). Returns (...,), nats summed over the latent dimensions."""
-    # ½ Σ (μ² + σ² − 1 − ln σ²)
-    return 0.5 * (mean**2 + logvar.exp() - 1 - logvar).sum(-1)
+    return 0.5 * (mean**2 + logvar.exp() - 1 - logvar).sum(-1)  # ½ Σ (μ² + σ² − 1 − ln σ²)
 
 def rssm_kl_loss(post, prior, balance=0.8, free_nats=1.0):
     """KL of posterior and prior in Eqs. (2), (5), with DreamerV2's balancing and free nats.
@@ -241,16 +231,14 @@ def distillation_loss(z_disen, z_task):
     Softmax over the latent dimensions makes probability vectors of both, so a constant added to all
     dimensions changes nothing. z_disen (the teacher's), z_task: samples, (B, T, Z). Returns a
     scalar, nats: summed over time, mean over the batch, the scale at which the paper tuned η."""
-    log_disen = z_disen.detach().log_softmax(-1)                              # the teacher is fixed
-    log_task = z_task.log_softmax(-1)
+    log_disen, log_task = z_disen.detach().log_softmax(-1), z_task.log_softmax(-1)  # sg: a teacher
     return (log_disen.exp() * (log_disen - log_task)).sum((-2, -1)).mean()
 
 def gaussian_distillation_loss(teacher, task):
     """Eq. (3) between the two Gaussian posteriors instead (ours), reduced like it.
     teacher, task: dicts of `mean` and `logvar`, (B, T, Z)."""
-    kl = gaussian_kl(teacher["mean"].detach(), (teacher["logvar"].detach() / 2).exp(),
-                     task["mean"], (task["logvar"] / 2).exp())
-    return kl.sum((-2, -1)).mean()
+    (mean, std), student = ((code["mean"], (code["logvar"] / 2).exp()) for code in (teacher, task))
+    return gaussian_kl(mean.detach(), std.detach(), *student).sum((-2, -1)).mean()
 
 def eta_schedule(step, start=0.1, end=0.01, decay_steps=50_000, delay=0):
     """η after `step` decisions (section 3.4): 0 before `delay`, then linearly from start to end.
@@ -328,15 +316,19 @@ def preprocess(image):
     return image.movedim(-1, -3).float() / 255 - 0.5
 
 class PerFrame(nn.Module):
-    """Layers for the last `dims` dimensions; all before them are one batch. fp32 out."""
+    """Layers for the last `dims` dimensions; all before them are one batch. fp32 out.
+    In the encoders and decoders, d is the number of channels of the image's convolution."""
 
     def __init__(self, dims, *layers):
         super().__init__()
         self.dims, self.net = dims, nn.Sequential(*layers)
 
     def forward(self, x):
-        lead, frame = x.shape[:-self.dims], x.shape[-self.dims:]
-        return self.net(x.reshape(-1, *frame)).float().unflatten(0, lead)
+        return self.net(x.flatten(0, -1 - self.dims)).float().unflatten(0, x.shape[:-self.dims])
+
+    def encode(self, image):
+        """→ dict of `embed`; a β-VAE's is a sample of 𝐳, with the `mean` and `logvar` behind it"""
+        return dict(embed=self(image))
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
@@ -351,7 +343,6 @@ class BetaVAEEncoder(PerFrame):
         return super().forward(image).chunk(2, -1)
 
     def encode(self, image):
-        """→ dict of `embed`, a sample of 𝐳, and the `mean` and `logvar` it came from"""
         mean, logvar = self(image)
         return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
 
@@ -363,15 +354,10 @@ def beta_vae_decoder(feat_dim, z_dim, d):
                     *stack(nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], shapes),
                     nn.ConvTranspose2d(d, 3, 4, 2, 1)).apply(kaiming)
 
-class ConvEncoder(PerFrame):
-    """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32·depth)."""
-
-    def __init__(self, d):
-        super().__init__(3, *stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4),
-                         nn.Flatten())                                        # 8·depth of 2 × 2
-
-    def encode(self, image):
-        return dict(embed=self(image))
+def conv_encoder(d):
+    """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32 d)."""
+    convolutions = stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4)
+    return PerFrame(3, *convolutions, nn.Flatten())                           # 8 d of 2 × 2
 
 def conv_decoder(feat_dim, d):
     """DreamerV2's decoder, for the baselines: feat (..., S + D) → (..., 3, 64, 64)."""
@@ -494,15 +480,12 @@ class VideoPredictor(nn.Module):
 
     def __init__(self, cfg, action_dim=0):
         super().__init__()
-        self.cfg, feat_dim, d = cfg, cfg.stoch + cfg.deter, cfg.cnn_depth
-        if cfg.encoder == "beta_vae":
-            self.encoder, embed_dim = BetaVAEEncoder(cfg.z_dim, d), cfg.z_dim
-            self.decoder = beta_vae_decoder(feat_dim, cfg.z_dim, d)
-        else:
-            self.encoder, embed_dim = ConvEncoder(d), 32 * d
-            self.decoder = conv_decoder(feat_dim, d)
+        self.cfg, vae = cfg, cfg.encoder == "beta_vae"
+        feat, d = cfg.stoch + cfg.deter, cfg.cnn_depth
+        self.encoder = BetaVAEEncoder(cfg.z_dim, d) if vae else conv_encoder(d)
+        self.decoder = beta_vae_decoder(feat, cfg.z_dim, d) if vae else conv_decoder(feat, d)
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
-        self.rssm = rssm(action_dim, embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
+        self.rssm = rssm(action_dim, cfg.z_dim if vae else 32 * d, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
 
     def forward(self, batch):
@@ -621,10 +604,9 @@ class ActorCritic(nn.Module):
         target = lambda_return(reward, slow[:-1], discount, slow[-1], cfg.lambda_)
         # w_t = Π_{i<t} γ_i: how likely the episode still runs. A weight, nothing to optimise.
         weight = torch.cat([torch.ones_like(discount[:1]), discount[:-1]]).cumprod(0).detach()
-        regression = target.detach()                                          # sg(V_t)
         value = self.critic(feats[:-1].detach())                              # the model is fixed
-        critic_loss = (weight * squared_error(regression, value)).mean()
-        advantage = regression - value.detach()                               # sg(V_t − v(s_t))
+        critic_loss = (weight * squared_error(target.detach(), value)).mean()  # sg(V_t)
+        advantage = (target - value).detach()                                 # sg(V_t − v(s_t))
         # ρ V_t + (1 − ρ) ln π(a_t | s_t) sg(V_t − v(s_t)) + scale · H[a_t | s_t]
         objective = (cfg.rho * target + (1 - cfg.rho) * log_prob * advantage
                      + cfg.entropy_scale * entropy)
@@ -651,9 +633,8 @@ class Adam(torch.optim.Adam):
             if [x.shape for x in moments.values()] != [(), p.shape, p.shape]:
                 raise ValueError("the optimiser's moments are another model's")
 
-def autocast(cfg):
+def autocast(cfg):  # 1.5× of a whole step on a CPU with native bf16
     """bf16 around convolutions and MLPs; statistics, GRU state, targets and losses are fp32."""
-    # 1.5× of a whole step on a CPU with native bf16.
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
 
 def to_device(batch, device):
@@ -718,8 +699,7 @@ class Agent:
         metrics["model_grad_norm"] = gradient_step(optimizers["model"], loss, metrics, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
-        # Imagine from the posteriors of the batch, which are data here.
-        start = {key: value.detach().flatten(0, 1) for key, value in out["post"].items()}
+        start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}   # data from here
         start["discount"] = cfg.gamma * batch["discount"].flatten()
         if cfg.imagine_starts:
             chosen = torch.randperm(len(start["discount"]), device=self.device)[:cfg.imagine_starts]
