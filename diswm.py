@@ -1,5 +1,5 @@
 """DisWM, the whole paper in one file: Wang et al., "Disentangled World Models: Learning to Transfer
-Semantic Knowledge from Distracting Videos for Reinforcement Learning", ICCV 2025, whose Eq. (n) it is.
+Semantic Knowledge from Distracting Videos for Reinforcement Learning", ICCV 2025; its "Eq. (n)".
 
 Videos of one task whose colours keep changing are enough to learn *which things in a picture vary
 independently*: a β-VAE inside an action-free video predictor finds latents for them. An agent in a
@@ -145,8 +145,7 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
-                        ("softmax", "gaussian"))
+    distill: str = flag("softmax", "latents in Eq. (3) (paper; ours)", ("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
@@ -672,9 +671,8 @@ class Agent:
         explore: sample the actor, else take its mode. Returns action, numpy (N, A), and state."""
         is_first = torch.full((len(image),), state is None, device=self.device)
         state = self.model.rssm.initial(len(image)) if state is None else state
-        image = preprocess(torch.as_tensor(image, device=self.device))
-        embed = self.model.encoder.encode(image)["embed"]
-        action = torch.as_tensor(action, device=self.device)
+        image, action = (torch.as_tensor(x, device=self.device) for x in (image, action))
+        embed = self.model.encoder.encode(preprocess(image))["embed"]
         state = self.model.rssm.step(state, action, embed, is_first)
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
@@ -682,8 +680,7 @@ class Agent:
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
         update: index of this step. probe: measure distillation's own gradient at the encoder."""
-        cfg, batch = self.cfg, to_device(batch, self.device)
-        optimizers, clip = self.optimizers, self.cfg.grad_clip
+        cfg, clip, batch = self.cfg, self.cfg.grad_clip, to_device(batch, self.device)
         with autocast(cfg):
             out = self.model(batch)
         if self.model.bonus:                                                  # in fp32
@@ -696,10 +693,10 @@ class Agent:
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
             metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
-        metrics["model_grad_norm"] = gradient_step(optimizers["model"], loss, metrics, clip)
+        metrics["model_grad_norm"] = gradient_step(self.optimizers["model"], loss, metrics, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
-        start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}   # data from here
+        start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}  # data here
         start["discount"] = cfg.gamma * batch["discount"].flatten()
         if cfg.imagine_starts:
             chosen = torch.randperm(len(start["discount"]), device=self.device)[:cfg.imagine_starts]
@@ -708,7 +705,7 @@ class Agent:
             *losses, more = self.behaviour.losses(self.model, start, start.pop("discount"))
         metrics |= more
         for name, loss in zip(("actor", "critic"), losses, strict=True):
-            metrics[f"{name}_grad_norm"] = gradient_step(optimizers[name], loss, metrics, clip)
+            metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, metrics, clip)
         return {key: value.detach() for key, value in metrics.items()}
 
     def state_dict(self):
