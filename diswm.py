@@ -1,7 +1,5 @@
-"""DisWM: Disentangled World Models, the whole paper in one file.
-
-    Wang et al., "Disentangled World Models: Learning to Transfer Semantic Knowledge from
-    Distracting Videos for Reinforcement Learning", ICCV 2025. "Eq. (n)" is the paper's equation.
+"""DisWM, the whole paper in one file: Wang et al., "Disentangled World Models: Learning to Transfer
+Semantic Knowledge from Distracting Videos for Reinforcement Learning", ICCV 2025; its "Eq. (n)".
 
 Videos of one task whose colours keep changing are enough to learn *which things in a picture vary
 independently*: a β-VAE inside an action-free video predictor finds latents for them. An agent in a
@@ -87,17 +85,15 @@ class UserError(Exception):
 
 # === Config =======================================================================================
 
-def flag(default, help, *, low=0, high=10**12, choices=None, free=False):
+def flag(default, help, choices=None, *, low=0, high=10**12, free=False):
     """A Config field and its flag. low, high: of numbers; free: may change on resuming."""
-    meta = dict(help=help, low=low, high=high, choices=choices, free=free)
-    return dataclasses.field(default=default, metadata=meta)
+    return dataclasses.field(default=default, metadata=locals())
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that can be set; the defaults are the paper's (`--preset paper`).
-    Sources: "table" is the paper's hyperparameter table, "published" the authors' configuration,
-    "ours" a choice of this implementation. An *env step* is one simulator step; a *decision* is one
-    action of the agent, held for `action_repeat` env steps."""
+    """All that can be set; the defaults are the paper's (`--preset paper`). Sources: "table" is its
+    table of hyperparameters, "published" the authors' configuration, "ours" our choice. An *env
+    step* is one of the simulator; a *decision* is an action held for `action_repeat` env steps."""
     # What is run, and where it is kept.
     src: str = flag("cheetah_run", "task of the distracting videos (paper, Fig. 4a)")
     dst: str = flag("walker_walk", "target task (paper, Fig. 4a)")
@@ -110,7 +106,7 @@ class Config:
     action_repeat: int = flag(2, "env steps per decision (published)", low=1)
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
     colors: str = flag("published", "colour boxes around fixed centres, or the original colours "
-                       "(published; paper)", choices=("published", "original"))
+                       "(published; paper)", ("published", "original"))
     color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)", high=1)
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
@@ -127,10 +123,9 @@ class Config:
     eval_episodes: int = flag(10, "episodes per evaluation (published)", low=1)
     replay_capacity: int = flag(1_000_000, "rows kept in the replay (published)", low=1)
     # World model, Eqs. (1), (2), (4), (5).
-    encoder: str = flag("beta_vae", "image encoder and decoder; conv: DreamerV2's (paper)",
-                        choices=("beta_vae", "conv"))
+    encoder: str = flag("beta_vae", "image nets; conv: DreamerV2's (paper)", ("beta_vae", "conv"))
     carry_over: str = flag("none", "where a video predictor's weights go: nowhere, into an agent's "
-                           "model, below its RSSM (paper)", choices=("none", "weights", "stack"))
+                           "model, below its RSSM (paper)", ("none", "weights", "stack"))
     bonus: float = flag(0.0, "weight of the intrinsic bonus in the reward's target (APV: 0.1)")
     z_dim: int = flag(20, "size of the β-VAE latent (table)", low=1, high=10_000)
     cnn_depth: int = flag(32, "channels of the first convolution (published)", low=1, high=1000)
@@ -150,8 +145,7 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
-                        choices=("softmax", "gaussian"))
+    distill: str = flag("softmax", "latents in Eq. (3) (paper; ours)", ("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
@@ -169,9 +163,9 @@ class Config:
     slow_every: int = flag(100, "updates between copies to the slow critic (published)", low=1)
     grad_clip: float = flag(100.0, "largest gradient norm of each optimiser (published)")
     # Machine.
-    device: str = flag("auto", "where it runs (ours)", choices=("auto", "cpu", "cuda"), free=True)
+    device: str = flag("auto", "where it runs (ours)", ("auto", "cpu", "cuda"), free=True)
     precision: str = flag("auto", "of convolutions and MLPs; auto: bf16 where native (ours)",
-                          choices=("auto", "fp32", "bf16"), free=True)
+                          ("auto", "fp32", "bf16"), free=True)
     threads: int = flag(0, "CPU threads; 0: one per core (ours)", high=1024, free=True)
 
     def __post_init__(self):
@@ -179,8 +173,7 @@ class Config:
         for field in dataclasses.fields(self):
             value, meta, kind = getattr(self, field.name), field.metadata, type(field.default)
             good = type(value) is kind or (kind is float and type(value) is int)
-            if good and kind in (int, float):
-                good = meta["low"] <= value <= meta["high"]                   # which no NaN is
+            good = good and (kind in (str, bool) or meta["low"] <= value <= meta["high"])  # not NaN
             if not good or value not in (meta["choices"] or [value]):
                 want = meta["choices"] or f"{kind.__name__} from {meta['low']} to {meta['high']:,}"
                 raise ValueError(f"--{field.name.replace('_', '-').strip('-')} {value}: not {want}")
@@ -189,32 +182,27 @@ PRESETS = {
     "paper": Config(),
     # The same algorithm for two CPU cores. A batch five times smaller wants a larger model_lr. η's
     # clock shrinks with the run (to a tenth), and η grows by 50 / 32 as Eq. (3) sums over time.
-    "small": Config(
-        steps=100_000, collect_steps=20_000, pretrain_updates=1_000, prefill=1_000,
-        fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, model_lr=1e-3,
-        cnn_depth=16, units=200, eta=0.156, eta_end=0.0156, eta_decay=5_000),
-    # Seconds, for tests: everything happens, nothing is learnt.
-    "debug": Config(
-        steps=300, collect_steps=200, pretrain_updates=20, prefill=50, first_updates=2,
-        train_every=10, eval_every=100, eval_episodes=2, time_limit=50, batch_size=3,
-        batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12, hidden=10, units=10, eta=0.6,
-        eta_end=0.06, eta_decay=60, slow_every=5, threads=1),
+    "small": Config(steps=100_000, collect_steps=20_000, pretrain_updates=1_000, prefill=1_000,
+                    fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
+                    cnn_depth=16, model_lr=1e-3, eta=0.156, eta_end=0.0156, eta_decay=5_000),
+    "debug": Config(  # seconds, for tests: everything happens, nothing is learnt
+        steps=300, collect_steps=200, pretrain_updates=20, prefill=50, first_updates=2, threads=1,
+        train_every=10, eval_every=100, eval_episodes=2, time_limit=50, batch_size=3, horizon=3,
+        batch_length=8, cnn_depth=4, stoch=6, deter=12, hidden=10, units=10, eta=0.6, eta_end=0.06,
+        eta_decay=60, slow_every=5),
 }
 
-# A method is a set of Config values and nothing else: all of them run through the same code.
-METHODS = {
+DV2 = dict(encoder="conv", beta=0.0, beta2=0.0, eta=0.0, eta_end=0.0, carry_over="none", bonus=0.0)
+METHODS = {  # sets of Config values and nothing else: all of them run through the same code
     "diswm": {},
     "no_distill": dict(eta=0.0, eta_end=0.0),        # ablation: no latent distillation
     "no_disentangle": dict(beta=0.0, beta2=0.0),     # ablation: no β in either stage
-    "dreamerv2": dict(encoder="conv", beta=0.0, beta2=0.0, eta=0.0, eta_end=0.0,
-                      carry_over="none", bonus=0.0),
+    "dreamerv2": DV2,
+    "dv2_finetune": DV2 | dict(carry_over="weights"),
+    "apv": DV2 | dict(carry_over="stack", bonus=0.1),
 }
-METHODS["dv2_finetune"] = METHODS["dreamerv2"] | dict(carry_over="weights")
-METHODS["apv"] = METHODS["dreamerv2"] | dict(carry_over="stack", bonus=0.1)
 
 # === Maths: pure functions of tensors =============================================================
-
-ACTION_LIMIT = 1 - 1e-6  # actions stay strictly inside (−1, 1)
 
 def gaussian_kl(mean_p, std_p, mean_q, std_q):
     """KL[N(mean_p, std_p²) || N(mean_q, std_q²)] of each dimension, nats: (..., S) → (..., S)."""
@@ -224,22 +212,17 @@ def gaussian_kl(mean_p, std_p, mean_q, std_q):
 def beta_vae_kl(mean, logvar):
     """Disentanglement loss of Eqs. (2), (5): KL[N(mean, exp(logvar)) || N(0, I)].
     mean, logvar: (..., Z). Returns (...,), nats summed over the latent dimensions."""
-    # ½ Σ (μ² + σ² − 1 − ln σ²)
-    return 0.5 * (mean**2 + logvar.exp() - 1 - logvar).sum(-1)
+    return 0.5 * (mean**2 + logvar.exp() - 1 - logvar).sum(-1)  # ½ Σ (μ² + σ² − 1 − ln σ²)
 
 def rssm_kl_loss(post, prior, balance=0.8, free_nats=1.0):
     """KL of posterior and prior in Eqs. (2), (5), with DreamerV2's balancing and free nats.
         balance · max(mean KL[sg(q) || p], free) + (1 − balance) · max(mean KL[q || sg(p)], free)
     post, prior: dicts of `mean` and `std`, (B, T, S). Returns (loss, value): a scalar and the plain
     KL (B, T), nats. Free nats act on the batch mean, as published: below them it is constant."""
-
-    def kl(q, p):
-        return gaussian_kl(q["mean"], q["std"], p["mean"], p["std"]).sum(-1)
-
-    def sg(dist):  # this side is the target of the other
-        return {"mean": dist["mean"].detach(), "std": dist["std"].detach()}
-    value = kl(post, sg(prior))                                               # (B, T), trains q
-    prior_side = kl(sg(post), prior).mean().clamp(min=free_nats)              # trains p
+    q, p = ((dist["mean"], dist["std"]) for dist in (post, prior))
+    sg_q, sg_p = ([x.detach() for x in side] for side in (q, p))              # the other's target
+    value = gaussian_kl(*q, *sg_p).sum(-1)                                    # (B, T), trains q
+    prior_side = gaussian_kl(*sg_q, *p).sum(-1).mean().clamp(min=free_nats)   # trains p
     return balance * prior_side + (1 - balance) * value.mean().clamp(min=free_nats), value
 
 def distillation_loss(z_disen, z_task):
@@ -247,16 +230,14 @@ def distillation_loss(z_disen, z_task):
     Softmax over the latent dimensions makes probability vectors of both, so a constant added to all
     dimensions changes nothing. z_disen (the teacher's), z_task: samples, (B, T, Z). Returns a
     scalar, nats: summed over time, mean over the batch, the scale at which the paper tuned η."""
-    log_disen = z_disen.detach().log_softmax(-1)                              # the teacher is fixed
-    log_task = z_task.log_softmax(-1)
+    log_disen, log_task = z_disen.detach().log_softmax(-1), z_task.log_softmax(-1)  # sg: a teacher
     return (log_disen.exp() * (log_disen - log_task)).sum((-2, -1)).mean()
 
 def gaussian_distillation_loss(teacher, task):
     """Eq. (3) between the two Gaussian posteriors instead (ours), reduced like it.
     teacher, task: dicts of `mean` and `logvar`, (B, T, Z)."""
-    kl = gaussian_kl(teacher["mean"].detach(), (teacher["logvar"].detach() / 2).exp(),
-                     task["mean"], (task["logvar"] / 2).exp())
-    return kl.sum((-2, -1)).mean()
+    (mean, std), student = ((code["mean"], (code["logvar"] / 2).exp()) for code in (teacher, task))
+    return gaussian_kl(mean.detach(), std.detach(), *student).sum((-2, -1)).mean()
 
 def eta_schedule(step, start=0.1, end=0.01, decay_steps=50_000, delay=0):
     """η after `step` decisions (section 3.4): 0 before `delay`, then linearly from start to end.
@@ -288,9 +269,9 @@ def gaussian_sample(mean, std):
     """A reparameterised draw: the gradient reaches mean and std."""
     return mean + std * torch.randn_like(std)
 
-def clip_action(action):
-    """Clip into (−1, 1) with a straight-through gradient: a saturated action can come back."""
-    return action + (action.clamp(-ACTION_LIMIT, ACTION_LIMIT) - action).detach()
+def clip_action(action, limit=1 - 1e-6):
+    """Clip strictly into (−1, 1), gradient straight through: a saturated action can come back."""
+    return action + (action.clamp(-limit, limit) - action).detach()
 
 def normal_log_prob(x, mean, std):
     """ln N(x; mean, std²), summed over the last dimension, nats: (..., A) → (...,)."""
@@ -304,18 +285,24 @@ def normal_entropy(std):
 
 def stack(layer, sizes, shapes):
     """Layers from size to size, each with ELU behind; shapes: (kernel, stride, padding) of each."""
-    # In place, 19 % less memory of a step at 50 × 50.
     return [part for n, m, shape in zip(sizes[:-1], sizes[1:], shapes, strict=True)
-            for part in (layer(n, m, *shape), nn.ELU(inplace=True))]
+            for part in (layer(n, m, *shape), nn.ELU(inplace=True))]  # 19 % less memory at 50 × 50
 
-def mlp(inputs, units, layers, outputs):
-    """`layers` hidden layers with ELU, then a linear one."""
-    hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
-    return nn.Sequential(*hidden, nn.Linear(units, outputs))
+class MLP(nn.Sequential):
+    """`layers` hidden layers with ELU, then a linear one, to a number (...,) or, given `dims`, to
+    a normal's mean and standard deviation in (0.1, 2.1), (..., dims) each. fp32 out."""
 
-def bounded_std(x):
-    """A standard deviation in (0.1, 2.1): 2 σ(x / 2) + 0.1."""
-    return 2 * torch.sigmoid(x / 2) + 0.1
+    def __init__(self, inputs, units, layers, dims=None):
+        hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
+        super().__init__(*hidden, nn.Linear(units, 2 * dims if dims else 1))
+        self.dims = dims
+
+    def forward(self, x):
+        x = super().forward(x).float()
+        if not self.dims:
+            return x.squeeze(-1)
+        mean, std = x.chunk(2, -1)
+        return mean, 2 * torch.sigmoid(std / 2) + 0.1
 
 def kaiming(module):
     """Kaiming-normal weights and zero biases, for the β-VAE only (published)."""
@@ -328,61 +315,55 @@ def preprocess(image):
     return image.movedim(-1, -3).float() / 255 - 0.5
 
 class PerFrame(nn.Module):
-    """`self.net` applied to the last `dims` dimensions; all before them are one batch. fp32 out."""
-    dims = 3
+    """Layers for the last `dims` dimensions; all before them are one batch. fp32 out.
+    In the encoders and decoders, d is the number of channels of the image's convolution."""
+
+    def __init__(self, dims, *layers):
+        super().__init__()
+        self.dims, self.net = dims, nn.Sequential(*layers)
 
     def forward(self, x):
-        lead = x.shape[:x.dim() - self.dims]
-        return self.net(x.reshape(-1, *x.shape[len(lead):])).float().unflatten(0, lead)
+        return self.net(x.flatten(0, -1 - self.dims)).float().unflatten(0, x.shape[:-self.dims])
+
+    def encode(self, image):
+        """→ dict of `embed`; a β-VAE's is a sample of 𝐳, with the `mean` and `logvar` behind it"""
+        return dict(embed=self(image))
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
 
-    def __init__(self, z_dim=20, depth=32):
-        super().__init__()
-        self.embed_dim, d = z_dim, depth
+    def __init__(self, z_dim, d):
         shapes = [(4, 2, 1)] * 4 + [(4,)]                                     # 32, 16, 8, 4, 1
-        convolutions = stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes)
-        self.net = nn.Sequential(*convolutions, nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
+        super().__init__(3, *stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes),
+                         nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
         self.apply(kaiming)
 
     def forward(self, image):
         return super().forward(image).chunk(2, -1)
 
-class BetaVAEDecoder(PerFrame):
+    def encode(self, image):
+        mean, logvar = self(image)
+        return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
+
+def beta_vae_decoder(feat_dim, z_dim, d):
     """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
-    dims = 1
+    shapes = [(4,)] + [(4, 2, 1)] * 3                                         # 4, 8, 16, 32, 64
+    return PerFrame(1, nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
+                    nn.Unflatten(-1, (8 * d, 1, 1)),
+                    *stack(nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], shapes),
+                    nn.ConvTranspose2d(d, 3, 4, 2, 1)).apply(kaiming)
 
-    def __init__(self, feat_dim, z_dim=20, depth=32):
-        super().__init__()
-        d = depth
-        self.net = nn.Sequential(
-            nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
-            nn.Unflatten(-1, (8 * d, 1, 1)), *stack(
-                nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], [(4,)] + [(4, 2, 1)] * 3),
-            nn.ConvTranspose2d(d, 3, 4, 2, 1))                                # 4, 8, 16, 32, 64
-        self.apply(kaiming)
+def conv_encoder(d):
+    """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32 d)."""
+    convolutions = stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4)
+    return PerFrame(3, *convolutions, nn.Flatten())                           # 8 d of 2 × 2
 
-class ConvEncoder(PerFrame):
-    """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32·depth)."""
-
-    def __init__(self, depth=32):
-        super().__init__()
-        self.embed_dim, d = 32 * depth, depth                                 # 8·depth of 2 × 2
-        convolutions = stack(nn.Conv2d, [3, d, 2 * d, 4 * d, 8 * d], [(4, 2)] * 4)
-        self.net = nn.Sequential(*convolutions, nn.Flatten())
-
-class ConvDecoder(PerFrame):
+def conv_decoder(feat_dim, d):
     """DreamerV2's decoder, for the baselines: feat (..., S + D) → (..., 3, 64, 64)."""
-    dims = 1
-
-    def __init__(self, feat_dim, depth=32):
-        super().__init__()
-        d = depth
-        self.net = nn.Sequential(
-            nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)), *stack(
-                nn.ConvTranspose2d, [32 * d, 4 * d, 2 * d, d], [(5, 2), (5, 2), (6, 2)]),
-            nn.ConvTranspose2d(d, 3, 6, 2))                                   # 5, 13, 30, 64
+    shapes = [(5, 2), (5, 2), (6, 2)]                                         # 5, 13, 30, 64
+    return PerFrame(1, nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)),
+                    *stack(nn.ConvTranspose2d, [32 * d, 4 * d, 2 * d, d], shapes),
+                    nn.ConvTranspose2d(d, 3, 6, 2))
 
 class RSSM(nn.Module):
     """Recurrent state-space model, Gaussian; action_dim=0 makes it the action-free one of Eq. (1).
@@ -394,18 +375,17 @@ class RSSM(nn.Module):
         action        0      a that led to o_1     (the paper's a_{t−1})
         reward        0      r that came with o_1
       is_first        1      0                     (forgets h, z *and* the action)
-          post       s_0    s_1
-    """
+          post       s_0    s_1"""
 
     def __init__(self, action_dim, embed_dim, stoch=50, deter=200, hidden=200):
         super().__init__()
-        self.action_dim, self.sizes = action_dim, dict(deter=deter, stoch=stoch, mean=stoch,
-                                                       std=stoch)
+        self.action_dim = action_dim
+        self.sizes = dict(deter=deter, stoch=stoch, mean=stoch, std=stoch)
         self.inputs = nn.Sequential(nn.Linear(stoch + action_dim, hidden), nn.ELU())
         self.gru = nn.Linear(hidden + deter, 3 * deter)
         self.norm = nn.LayerNorm(3 * deter)
-        self.prior_net = mlp(deter, hidden, 1, 2 * stoch)
-        self.post_net = mlp(deter + embed_dim, hidden, 1, 2 * stoch)
+        self.prior_net = MLP(deter, hidden, 1, stoch)
+        self.post_net = MLP(deter + embed_dim, hidden, 1, stoch)
 
     @staticmethod
     def feat(state):
@@ -427,8 +407,7 @@ class RSSM(nn.Module):
 
     def draw(self, net, inputs, deter):
         """A state around h_t: `net`'s distribution, a sample."""
-        mean, std = net(inputs).float().chunk(2, -1)
-        std = bounded_std(std)
+        mean, std = net(inputs)
         return dict(deter=deter, mean=mean, std=std, stoch=gaussian_sample(mean, std))
 
     def prior(self, deter):
@@ -500,42 +479,31 @@ class VideoPredictor(nn.Module):
 
     def __init__(self, cfg, action_dim=0):
         super().__init__()
-        self.cfg, feat_dim = cfg, cfg.stoch + cfg.deter
-        if cfg.encoder == "beta_vae":
-            self.encoder = BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth)
-            self.decoder = BetaVAEDecoder(feat_dim, cfg.z_dim, cfg.cnn_depth)
-        else:
-            self.encoder = ConvEncoder(cfg.cnn_depth)
-            self.decoder = ConvDecoder(feat_dim, cfg.cnn_depth)
+        self.cfg, vae = cfg, cfg.encoder == "beta_vae"
+        feat, d = cfg.stoch + cfg.deter, cfg.cnn_depth
+        self.encoder = BetaVAEEncoder(cfg.z_dim, d) if vae else conv_encoder(d)
+        self.decoder = beta_vae_decoder(feat, cfg.z_dim, d) if vae else conv_decoder(feat, d)
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
-        self.rssm = rssm(action_dim, self.encoder.embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
+        self.rssm = rssm(action_dim, cfg.z_dim if vae else 32 * d, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
 
-    def encode(self, image):
-        """image (..., 3, 64, 64) → (embed, code).
-        β-VAE: a sample of 𝐳 (..., Z), and its dict of mean and logvar. DreamerV2's encoder: {}."""
-        if isinstance(self.encoder, BetaVAEEncoder):
-            mean, logvar = self.encoder(image)
-            return gaussian_sample(mean, (logvar / 2).exp()), dict(mean=mean, logvar=logvar)
-        return self.encoder(image), {}
-
     def forward(self, batch):
-        """Filter → dict of embed, code, post, prior, feat."""
-        embed, code = self.encode(batch["image"])
-        post, prior = self.rssm.observe(embed, batch.get("action"), batch["is_first"])
-        return dict(embed=embed, code=code, post=post, prior=prior, feat=self.rssm.feat(post))
+        """Filter → dict of code (of encode), post, prior, feat."""
+        code = self.encoder.encode(batch["image"])
+        post, prior = self.rssm.observe(code["embed"], batch.get("action"), batch["is_first"])
+        return dict(code=code, post=post, prior=prior, feat=self.rssm.feat(post))
 
     def terms(self, out, batch):
         """Loss terms of each step, (B, T), nats, but for the KL."""
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
-        error = squared_error(batch["image"], self.decoder(out["feat"]))
-        terms = dict(image=error.sum((-3, -2, -1)))
-        return terms | (dict(disentangle=beta_vae_kl(**out["code"])) if out["code"] else {})
+        error, code = squared_error(batch["image"], self.decoder(out["feat"])), out["code"]
+        vae = dict(disentangle=beta_vae_kl(code["mean"], code["logvar"])) if "mean" in code else {}
+        return dict(image=error.sum((-3, -2, -1))) | vae
 
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
         teacher: dict of embed, mean, logvar of the same images from the frozen teacher, or None."""
-        cfg, terms = self.cfg, self.terms(out, batch)
+        cfg, code, terms = self.cfg, out["code"], self.terms(out, batch)
         loss, kl = rssm_kl_loss(out["post"], out["prior"], cfg.kl_balance, cfg.free_nats)
         metrics = dict(kl_loss=loss, kl=kl.mean(), eta=torch.tensor(eta),
                        post_entropy=normal_entropy(out["post"]["std"]).mean(),
@@ -545,8 +513,8 @@ class VideoPredictor(nn.Module):
             metrics[name] = term.mean()
             loss = loss + self.scales[name] * metrics[name]
         if teacher is not None:
-            distill = (distillation_loss(teacher["embed"], out["embed"]) if cfg.distill == "softmax"
-                       else gaussian_distillation_loss(teacher, out["code"]))
+            distill = (gaussian_distillation_loss(teacher, code) if cfg.distill == "gaussian"
+                       else distillation_loss(teacher["embed"], code["embed"]))
             loss, metrics["distill"] = loss + eta * distill, distill
         return loss, metrics
 
@@ -557,8 +525,8 @@ class WorldModel(VideoPredictor):
         super().__init__(cfg, action_dim)
         self.scales = dict(image=1.0, kl=cfg.alpha, disentangle=cfg.beta, reward=cfg.reward_scale,
                            discount=cfg.discount_scale)
-        self.reward = mlp(cfg.stoch + cfg.deter, cfg.units, 2, 1)
-        self.discount = mlp(cfg.stoch + cfg.deter, cfg.units, 3, 1)
+        self.reward = MLP(cfg.stoch + cfg.deter, cfg.units, 2)        # r̂, mean of a unit Gaussian
+        self.discount = MLP(cfg.stoch + cfg.deter, cfg.units, 3)                  # the logit of γ̂
         self.bonus = IntrinsicBonus(cfg.stoch + cfg.deter) if cfg.bonus else None
 
     @torch.no_grad()
@@ -569,20 +537,12 @@ class WorldModel(VideoPredictor):
         for weight, value in zip(own.parameters(), video.parameters(), strict=True):
             weight[..., :value.shape[-1]] = value
 
-    def predict_reward(self, feat):
-        """r̂, the mean of a unit Gaussian: (..., S + D) → (...,)"""
-        return self.reward(feat).squeeze(-1).float()
-
-    def predict_discount(self, feat):
-        """The logit of γ̂: (..., S + D) → (...,)"""
-        return self.discount(feat).squeeze(-1).float()
-
     def terms(self, out, batch):
         """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
         feat = out["feat"][:, :batch["reward"].shape[1]]  # the last rows have no intrinsic bonus
-        reward = squared_error(batch["reward"], self.predict_reward(feat))
+        reward = squared_error(batch["reward"], self.reward(feat))
         # DEVIATION: the discount head of Eq. (4) is trained; the published code switches it off.
-        logit, target = self.predict_discount(out["feat"]), self.cfg.gamma * batch["discount"]
+        logit, target = self.discount(out["feat"]), self.cfg.gamma * batch["discount"]
         discount = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
         return super().terms(out, batch) | dict(reward=reward, discount=discount)
 
@@ -594,9 +554,9 @@ class ActorCritic(nn.Module):
     def __init__(self, cfg, action_dim):
         super().__init__()
         self.cfg, feat_dim = cfg, cfg.stoch + cfg.deter
-        self.actor = mlp(feat_dim, cfg.units, 4, 2 * action_dim)
-        self.critic = mlp(feat_dim, cfg.units, 3, 1)
-        self.slow_critic = mlp(feat_dim, cfg.units, 3, 1).requires_grad_(False)   # only copied
+        self.actor = MLP(feat_dim, cfg.units, 4, action_dim)
+        self.critic = MLP(feat_dim, cfg.units, 3)
+        self.slow_critic = MLP(feat_dim, cfg.units, 3).requires_grad_(False)      # only copied
         self.copy_critic()
 
     def copy_critic(self):
@@ -605,12 +565,8 @@ class ActorCritic(nn.Module):
 
     def policy(self, feat):
         """→ mean in (−1, 1) and std of the normal of actions, (..., A)"""
-        mean, std = self.actor(feat).float().chunk(2, -1)
-        return torch.tanh(mean), bounded_std(std)
-
-    def value(self, feat, slow=False):
-        """v(s): (..., S + D) → (...,)"""
-        return (self.slow_critic if slow else self.critic)(feat).squeeze(-1).float()
+        mean, std = self.actor(feat)
+        return torch.tanh(mean), std
 
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
@@ -639,18 +595,17 @@ class ActorCritic(nn.Module):
         which is *not* trained here: take gradients for the actor's own parameters only."""
         cfg = self.cfg
         feats, log_prob, entropy = self.imagine(model, start)
-        reward = model.predict_reward(feats[:-1])                             # (H, N)
-        discount = torch.sigmoid(model.predict_discount(feats[:-1]))
+        reward = model.reward(feats[:-1])                                     # (H, N)
+        discount = torch.sigmoid(model.discount(feats[:-1]))
         discount = torch.cat([start_discount[None], discount[1:]])            # γ_0 is known
-        slow = self.value(feats, slow=True)                                   # (H + 1, N)
+        slow = self.slow_critic(feats)                                        # (H + 1, N)
         # DEVIATION: the published λ-return comes out reversed in time.
         target = lambda_return(reward, slow[:-1], discount, slow[-1], cfg.lambda_)
         # w_t = Π_{i<t} γ_i: how likely the episode still runs. A weight, nothing to optimise.
         weight = torch.cat([torch.ones_like(discount[:1]), discount[:-1]]).cumprod(0).detach()
-        regression = target.detach()                                          # sg(V_t)
-        value = self.value(feats[:-1].detach())                               # the model is fixed
-        critic_loss = (weight * squared_error(regression, value)).mean()
-        advantage = regression - value.detach()                               # sg(V_t − v(s_t))
+        value = self.critic(feats[:-1].detach())                              # the model is fixed
+        critic_loss = (weight * squared_error(target.detach(), value)).mean()  # sg(V_t)
+        advantage = (target - value).detach()                                 # sg(V_t − v(s_t))
         # ρ V_t + (1 − ρ) ln π(a_t | s_t) sg(V_t − v(s_t)) + scale · H[a_t | s_t]
         objective = (cfg.rho * target + (1 - cfg.rho) * log_prob * advantage
                      + cfg.entropy_scale * entropy)
@@ -677,9 +632,8 @@ class Adam(torch.optim.Adam):
             if [x.shape for x in moments.values()] != [(), p.shape, p.shape]:
                 raise ValueError("the optimiser's moments are another model's")
 
-def autocast(cfg):
+def autocast(cfg):  # 1.5× of a whole step on a CPU with native bf16
     """bf16 around convolutions and MLPs; statistics, GRU state, targets and losses are fp32."""
-    # 1.5× of a whole step on a CPU with native bf16.
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
 
 def to_device(batch, device):
@@ -717,41 +671,32 @@ class Agent:
         explore: sample the actor, else take its mode. Returns action, numpy (N, A), and state."""
         is_first = torch.full((len(image),), state is None, device=self.device)
         state = self.model.rssm.initial(len(image)) if state is None else state
-        embed, _ = self.model.encode(preprocess(torch.as_tensor(image, device=self.device)))
-        action = torch.as_tensor(action, device=self.device)
+        image, action = (torch.as_tensor(x, device=self.device) for x in (image, action))
+        embed = self.model.encoder.encode(preprocess(image))["embed"]
         state = self.model.rssm.step(state, action, embed, is_first)
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
 
-    def teach(self, image):
-        """What the frozen teacher sees: embed, mean, logvar; or None."""
-        if self.teacher is None:
-            return None
-        with torch.no_grad():                                                 # its knowledge stays
-            mean, logvar = self.teacher(image)
-            return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
-
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
         update: index of this step. probe: measure distillation's own gradient at the encoder."""
-        cfg, batch = self.cfg, to_device(batch, self.device)
-        optimizers, clip = self.optimizers, self.cfg.grad_clip
+        cfg, clip, batch = self.cfg, self.cfg.grad_clip, to_device(batch, self.device)
         with autocast(cfg):
             out = self.model(batch)
         if self.model.bonus:                                                  # in fp32
             bonus = self.model.bonus(out["post"].get("below", out["feat"]))
             batch["reward"] = batch["reward"][:, :bonus.shape[1]] + cfg.bonus * bonus
         with autocast(cfg):
-            loss, metrics = self.model.loss(out, batch, self.teach(batch["image"]), eta)
+            teacher = self.teacher.encode(batch["image"]) if self.teacher else None
+            loss, metrics = self.model.loss(out, batch, teacher, eta)
         if probe and "distill" in metrics:
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
             metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
-        metrics["model_grad_norm"] = gradient_step(optimizers["model"], loss, metrics, clip)
+        metrics["model_grad_norm"] = gradient_step(self.optimizers["model"], loss, metrics, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
-        # Imagine from the posteriors of the batch, which are data here.
-        start = {key: value.detach().flatten(0, 1) for key, value in out["post"].items()}
+        start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}  # data here
         start["discount"] = cfg.gamma * batch["discount"].flatten()
         if cfg.imagine_starts:
             chosen = torch.randperm(len(start["discount"]), device=self.device)[:cfg.imagine_starts]
@@ -760,7 +705,7 @@ class Agent:
             *losses, more = self.behaviour.losses(self.model, start, start.pop("discount"))
         metrics |= more
         for name, loss in zip(("actor", "critic"), losses, strict=True):
-            metrics[f"{name}_grad_norm"] = gradient_step(optimizers[name], loss, metrics, clip)
+            metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, metrics, clip)
         return {key: value.detach() for key, value in metrics.items()}
 
     def state_dict(self):

@@ -611,9 +611,9 @@ def check_behaviour_losses_are_appendix_b(seed=0, rho=0.6):
     first = 0.99 * torch.tensor([1.0, 0.0, 1.0])
     actor, critic, _ = behaviour.losses(model, model.rssm.initial(3), first)
     with torch.no_grad():
-        reward, gamma = model.predict_reward(feats), torch.sigmoid(model.predict_discount(feats))
+        reward, gamma = model.reward(feats), torch.sigmoid(model.discount(feats))
         gamma[0] = first
-        slow, online = behaviour.value(feats, slow=True), behaviour.value(feats).numpy()
+        slow, online = behaviour.slow_critic(feats), behaviour.critic(feats).numpy()
     target = n_step_mixture(reward[:-1], slow[:-1], gamma[:-1], slow[-1], behaviour.cfg.lambda_)
     actor_sum = critic_sum = 0.0
     for n in range(3):
@@ -702,7 +702,7 @@ def test_slow_critic_is_copied_at_update_zero_and_every_slow_every_updates():
 def noise_teacher(out, seed=0):
     """A teacher's latents for the output of a world model."""
     torch.manual_seed(seed)
-    return {key: torch.randn_like(out["embed"]) for key in ("embed", "mean", "logvar")}
+    return {key: torch.randn_like(out["code"]["embed"]) for key in ("embed", "mean", "logvar")}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -773,7 +773,7 @@ def test_the_world_models_loss_is_the_weighted_sum_of_equation_5(
              + discount * m["discount"] + eta * m["distill"])
     torch.testing.assert_close(loss, total)
     if mode == "softmax":
-        student = Categorical(logits=out["embed"])
+        student = Categorical(logits=out["code"]["embed"])
         oracle = kl_divergence(Categorical(logits=teacher["embed"]), student).sum(1).mean()
         torch.testing.assert_close(m["distill"], oracle)
 
@@ -795,8 +795,8 @@ def test_the_terms_are_the_negative_log_likelihoods_of_equations_4_and_5():
     terms = model.terms(out, batch)
     feat, constant = out["feat"], Normal(0.0, 1.0).log_prob(torch.zeros(()))
     image = (constant - Normal(model.decoder(feat), 1.0).log_prob(batch["image"])).sum((-3, -2, -1))
-    reward = constant - Normal(model.predict_reward(feat), 1.0).log_prob(batch["reward"])
-    p, target = torch.sigmoid(model.predict_discount(feat)), 0.99 * batch["discount"]
+    reward = constant - Normal(model.reward(feat), 1.0).log_prob(batch["reward"])
+    p, target = torch.sigmoid(model.discount(feat)), 0.99 * batch["discount"]
     entropy = -target * p.log() - (1 - target) * (1 - p).log()
     std = (out["code"]["logvar"] / 2).exp()
     disentangle = kl_divergence(Normal(out["code"]["mean"], std), Normal(0.0, 1.0)).sum(-1)
@@ -938,7 +938,7 @@ def test_latents_are_sampled_not_means():
     for model in (diswm.VideoPredictor(cfg), diswm.WorldModel(cfg, 2)):
         one, two = model(batch), model(batch)
         assert torch.equal(one["code"]["mean"], two["code"]["mean"])
-        assert not torch.allclose(one["embed"], two["embed"])
+        assert not torch.allclose(one["code"]["embed"], two["code"]["embed"])
         assert not torch.allclose(one["post"]["stoch"], one["post"]["mean"])
 
 
@@ -1047,7 +1047,7 @@ def test_the_bonus_is_added_to_the_rewards_target_and_the_last_rows_have_none(ca
 
     def spy(out, batch, teacher, eta):
         seen.update(out=out, reward=batch["reward"], terms=agent.model.terms(out, batch),
-                    prediction=agent.model.predict_reward(out["feat"])[:, :4])
+                    prediction=agent.model.reward(out["feat"])[:, :4])
         return loss(out, batch, teacher, eta)
     agent.model.loss, data = spy, fake_batch()
     agent.update(data, 0.0, 0)
