@@ -1126,10 +1126,9 @@ class Pixels(gym.ObservationWrapper):
     def __init__(self, env, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
-        model, self.camera = self.unwrapped.model, 0
-        if not isinstance(self.unwrapped, DMControlEnv):                      # gymnasium's rule
-            self.camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
-        if self.camera < 0:
+        model, dmc = self.unwrapped.model, isinstance(self.unwrapped, DMControlEnv)
+        self.camera = 0 if dmc else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+        if self.camera < 0:                                                   # gymnasium's rule
             self.camera = mujoco.MjvCamera()
             mujoco.mjv_defaultFreeCamera(model, self.camera)
             library = getattr(self.unwrapped, "mujoco_renderer", None)
