@@ -727,8 +727,7 @@ VIDEO_KEYS = ("image", "is_first")  # all that a video predictor may see
 
 def make_row(image, action, reward=0.0, terminal=False, first=False):
     """One row of an episode."""
-    return dict(image=image, action=action, reward=reward, discount=1.0 - terminal, is_first=first,
-                is_terminal=terminal)
+    return dict(zip(ROW, (image, action, reward, 1.0 - terminal, first, terminal), strict=True))
 
 @contextlib.contextmanager
 def atomic(path):
@@ -758,7 +757,7 @@ def reading(path, kind="checkpoint of ours", remedy="restore it, or start over w
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from None
 
 def npz_layout(path, keys, plain=True):
-    """Where the arrays of an .npz lie in the file: {key: (offset, dtype, shape)}, bytes.
+    """Where the arrays of an .npz lie in the file: {key: dict(offset, dtype, shape)}, bytes.
     The offset of an array that is compressed, or in Fortran's order, is None. Raises UserError
     unless `keys` are arrays as make_row has them, a row for each image uint8 (64, 64, 3); `plain`:
     and have an offset. Nothing is unpacked: a zip bomb is refused by the size that it declares."""
@@ -775,14 +774,14 @@ def npz_layout(path, keys, plain=True):
             start = info.header_offset + 30 + int(np.frombuffer(file.read(4), "<u2").sum())
             mapped = info.compress_type == zipfile.ZIP_STORED and not fortran  # two lengths
             end = start + (info.file_size if mapped else info.compress_size)
-            if (info.file_size != header + math.prod(shape) * dtype.itemsize
-                    or end > os.fstat(file.fileno()).st_size):
+            size = header + math.prod(shape) * dtype.itemsize
+            if info.file_size != size or end > os.path.getsize(path):
                 raise ValueError(f"{info.filename} is cut off, or no plain array")
             name = info.filename.removesuffix(".npy")
-            layout[name] = start + header if mapped else None, dtype, shape
-        length = len(range(layout["image"][2][0]))
+            layout[name] = dict(offset=start + header if mapped else None, dtype=dtype, shape=shape)
+        length = len(range(layout["image"]["shape"][0]))
         for key in keys:
-            offset, dtype, shape = layout[key]
+            offset, dtype, shape = layout[key].values()
             row = dict(image=(64, 64, 3), action=shape[1:2]).get(key, ())
             if dtype != ROW[key] or shape != (length, *row) or not length:
                 raise ValueError(f"{key} is {dtype} {shape}, not {np.dtype(ROW[key])} (T, *{row})")
@@ -793,36 +792,34 @@ def npz_layout(path, keys, plain=True):
 class Replay:
     """Finished episodes, a file each, laid end to end; windows start uniformly anywhere.
 
-    Only an index is in memory; `sample` maps the rows of its windows. `np.load` opens a file; it
-    is not compressed, so the rows of an array follow each other in it.
+    Only an index is in memory. Files, for `np.load`, are not compressed: `sample` maps their rows.
         episodes    ┌──────── 0 ────────┐┌──── 1 ────┐┌─────── 2 ──────
         rows        F . . . . . . . . . .F . . . . . .F . . . . . . . .      F: is_first
         a window                [. . . . . . F . . .]
     """
 
     def __init__(self, folder, capacity=None, keys=tuple(ROW)):
-        # All files at first: a checkpoint may need those that the ones after it pushed out.
-        self.folder, self.capacity, self.keys = Path(folder), None, keys
+        self.folder, self.capacity, self.keys = Path(folder), capacity, keys
+        # All files: a checkpoint may need those that the ones after it pushed out.
         self._hold([(path, npz_layout(path, keys)) for path in sorted(self.folder.glob("*.npz"))])
-        self.capacity = capacity
         last = self.paths[-1].stem if self.paths else ""
         self.next_index = int(last) + 1 if last.isdecimal() else 0
 
     def _hold(self, episodes):
-        """Index (path, layout) pairs, less the oldest beyond capacity."""
-        lengths = [layout["image"][2][0] for _, layout in episodes]
-        while self.capacity and sum(lengths[1:]) >= self.capacity:
-            del episodes[0], lengths[0]
-        self.episodes, self.ends = episodes, np.cumsum(lengths).tolist()
-        self.paths, self.rows = [path for path, _ in episodes], sum(lengths)
+        """Index (path, layout) pairs."""
+        self.episodes, self.paths = episodes, [path for path, _ in episodes]
+        self.ends = np.cumsum([layout["image"]["shape"][0] for _, layout in episodes]).tolist()
+        self.rows = self.ends[-1] if episodes else 0
 
     def add(self, rows):
-        """Append a finished episode, a list of `make_row`."""
+        """Append a finished episode, a list of `make_row`; the oldest beyond capacity go."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{self.next_index:06d}.npz"
         with atomic(path) as file:
             np.savez(file, **{key: np.array([r[key] for r in rows], ROW[key]) for key in ROW})
         self._hold([*self.episodes, (path, npz_layout(path, self.keys))])
+        while self.capacity and self.rows - self.ends[0] >= self.capacity:
+            self._hold(self.episodes[1:])
         self.next_index += 1
 
     def prune(self):
@@ -832,8 +829,7 @@ class Replay:
 
     def state_dict(self):
         """Which episodes there are: the first one and the next to come."""
-        first = int(self.paths[0].stem) if self.paths else self.next_index
-        return dict(first=first, next=self.next_index)
+        return dict(first=self.next_index - len(self.paths), next=self.next_index)
 
     def load_state_dict(self, state):
         """Return to those episodes; later ones, of a run cut off, go."""
@@ -846,17 +842,16 @@ class Replay:
 
     def window(self, start, length):
         """Rows start … start + length − 1: dict of (T, ...)"""
-        pieces = {key: [] for key in self.keys}
+        pieces = []
         while length > 0:
             index = np.searchsorted(self.ends, start, "right")
             count = min(length, self.ends[index] - start)
             path, layout = self.episodes[index]
-            row = start - self.ends[index] + layout["image"][2][0]            # within the episode
-            for key in self.keys:
-                offset, dtype, shape = layout[key]
-                pieces[key].append(np.memmap(path, dtype, "r", offset, shape)[row:row + count])
+            row = start - self.ends[index] + layout["image"]["shape"][0]      # within the episode
+            pieces.append({key: np.memmap(path, mode="r", **layout[key])[row:row + count]
+                           for key in self.keys})
             start, length = start + count, length - count
-        return {key: np.concatenate(piece) for key, piece in pieces.items()}
+        return {key: np.concatenate([piece[key] for piece in pieces]) for key in self.keys}
 
     def sample(self, batch_size, length, rng):
         """Dict of (B, T, ...); windows begin is_first."""
@@ -870,19 +865,18 @@ def open_videos(folder, cache):
     """The .npz episodes of a folder as a Replay of images.
     Foreign ones (the authors' are compressed and lack is_first) are unpacked into `cache`, once."""
     paths = sorted(Path(folder).glob("*.npz"))
-    layouts = {path: npz_layout(path, ("image",), plain=False) for path in paths}
+    layouts = [npz_layout(path, ("image",), plain=False) for path in paths]
     if not layouts:
         raise UserError(f"no episodes (*.npz) in {folder}; run: python diswm.py collect --src TASK")
-    if all("is_first" in layout and layout["image"][0] for layout in layouts.values()):
+    if all("is_first" in layout and layout["image"]["offset"] for layout in layouts):
         return Replay(folder, keys=VIDEO_KEYS)
     cache.mkdir(parents=True, exist_ok=True)
-    for path in layouts:
+    for path in paths:
         if not (cache / path.name).exists():
             with reading(path, "video", "remove it"), np.load(path, allow_pickle=False) as episode:
-                image = episode["image"]
+                image = np.ascontiguousarray(episode["image"])
             with atomic(cache / path.name) as file:
-                np.savez(file, image=np.ascontiguousarray(image),
-                         is_first=np.arange(len(image)) == 0)
+                np.savez(file, image=image, is_first=np.arange(len(image)) == 0)
     return Replay(cache, keys=VIDEO_KEYS)
 
 # === Environments =================================================================================
@@ -937,15 +931,13 @@ class DMControlEnv(gym.Env):
 
 def drawer_world(task):
     """DrawerWorld: Meta-World's task with three table tops; reset(options={"phase": …}) chooses."""
-    import metaworld  # takes a second
-    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
-    folder = f"{metaworld.__path__[0]}/assets/textures"
+    import metaworld.env_dict  # takes a second
+    path = metaworld.__path__[0] + "/assets/textures/"
     grid = dict(builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mark=mujoco.mjtMark.mjMARK_EDGE,
                 rgb1=(0.1, 0.2, 0.3), rgb2=(0.2, 0.3, 0.4), width=300, height=300)
-    tops = dict(train=grid, shifted=dict(file=f"{folder}/wood.png"),
-                eval=dict(file=f"{folder}/metal.png"))
+    tops = dict(train=grid, shifted={"file": path + "wood.png"}, eval={"file": path + "metal.png"})
 
-    class DrawerWorld(ALL_V3_ENVIRONMENTS[task.replace("_", "-") + "-v3"]):
+    class DrawerWorld(metaworld.env_dict.ALL_V3_ENVIRONMENTS[task.replace("_", "-") + "-v3"]):
         def _initialize_simulation(self):
             spec = mujoco.MjSpec.from_file(self.fullpath)
             for phase, source in tops.items():
@@ -1010,11 +1002,9 @@ def color_box(phase, original, colors="published", half_range=0.2):
     Around the original colours, `shifted` rotates their channels (ours)."""
     if phase == "none":
         return original, original
-    phase = "shifted" if phase == "eval" else phase                           # not kept apart
-    if colors == "published":
-        center = np.broadcast_to(COLOR_CENTERS[phase], original.shape)
-    else:
-        center = original if phase == "train" else np.roll(original, 1, -1)
+    center = original if phase == "train" else np.roll(original, 1, -1)
+    if colors == "published":                                                 # no own one for eval
+        center = np.broadcast_to(COLOR_CENTERS[phase.replace("eval", "shifted")], original.shape)
     return np.clip(center - half_range, 0, 1), np.clip(center + half_range, 0, 1)
 
 def color_groups(task, model):
@@ -1041,12 +1031,13 @@ class ColorDistractor(gym.Wrapper):
 
     def __init__(self, env, task, phase, colors="published", half_range=0.2, step_std=0.0):
         super().__init__(env)
-        self.phase, self.colors = phase, colors
-        self.half_range, self.step_std = half_range, step_std
+        self.phase, self.step_std, self.rng = phase, step_std, np.random.default_rng()
         self.groups = color_groups(task, self.unwrapped.model)
         self.original = [array[rows, :3] for _, array, rows in self.groups]   # copies
-        self.tint = np.arange(len(self.groups))[:, None] >= (task == "pusher")  # black: its object
-        self.rng = np.random.default_rng()
+        original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
+        tint = np.arange(len(original))[:, None] >= (task == "pusher")        # black: its object
+        self.boxes = {name: np.multiply(color_box(name, original, colors, half_range), tint)
+                      for name in PHASES}
 
     def paint(self, colors):
         """Give each group its colour, or its rows theirs."""
@@ -1059,9 +1050,7 @@ class ColorDistractor(gym.Wrapper):
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
         self.phase = (options or {}).get("phase", self.phase)
-        original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
-        self.box = color_box(self.phase, original, self.colors, self.half_range)
-        colors = self.rng.uniform(*self.box) * self.tint
+        colors = self.rng.uniform(*self.boxes[self.phase])
         self.paint(self.original if self.phase == "none" else colors)
         return self.env.reset(seed=seed, options=(options or {}) | {"phase": self.phase})
 
@@ -1070,7 +1059,7 @@ class ColorDistractor(gym.Wrapper):
         if self.step_std and self.phase != "none":
             rgb = np.float32(self.current)                                    # as the model does
             walk = rgb + self.rng.normal(0, self.step_std, rgb.shape)
-            self.paint(np.clip(walk, *self.box) * self.tint)
+            self.paint(np.clip(walk, *self.boxes[self.phase]))
         return self.env.step(action)
 
 class Pixels(gym.ObservationWrapper):
@@ -1082,19 +1071,17 @@ class Pixels(gym.ObservationWrapper):
     def __init__(self, env, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
-        model, self.camera = self.unwrapped.model, 0
-        if not isinstance(self.unwrapped, DMControlEnv):                      # gymnasium's rule
-            self.camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
-        if self.camera < 0:
+        model, dmc = self.unwrapped.model, isinstance(self.unwrapped, DMControlEnv)
+        self.camera = 0 if dmc else mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+        if self.camera < 0:                                                   # gymnasium's rule
             self.camera = mujoco.MjvCamera()
             mujoco.mjv_defaultFreeCamera(model, self.camera)
             library = getattr(self.unwrapped, "mujoco_renderer", None)
             for key, value in (getattr(library, "default_cam_config", None) or {}).items():
                 setattr(self.camera, key, value)
-        quality = model.vis.quality
-        quality.shadowsize = 512          # 20–60 % of a frame, for a mean difference < 0.2 / 255
+        model.vis.quality.shadowsize = 512  # 20–60 % of a frame, for a mean difference < 0.2 / 255
         if fast:
-            quality.offsamples = 0        # half of the rest, for 1–2 / 255
+            model.vis.quality.offsamples = 0  # half of the rest, for 1–2 / 255
         self.renderer = mujoco.Renderer(model, size, size)
         atexit.register(self.renderer.close)  # one that is open at exit prints GL errors
 
@@ -1168,9 +1155,8 @@ def config_env(cfg, task, phase, **kwargs):
     """make_env with the values of a Config."""
     if multiprocessing.parent_process():
         signal.signal(signal.SIGINT, signal.SIG_IGN)                          # one takes Ctrl-C
-    return make_env(task, phase=phase, action_repeat=cfg.action_repeat, time_limit=cfg.time_limit,
-                    colors=cfg.colors, color_range=cfg.color_range, fast_render=cfg.fast_render,
-                    color_step_std=cfg.color_step_std, **kwargs)
+    names = "action_repeat", "time_limit", "colors", "color_range", "color_step_std", "fast_render"
+    return make_env(task, phase=phase, **{name: getattr(cfg, name) for name in names}, **kwargs)
 
 def config_envs(cfg, task, **kwargs):
     """cfg.envs of them as a gymnasium.vector.VectorEnv: one in this process, several in others."""
@@ -1210,8 +1196,7 @@ def play_episodes(envs, policy, seeds, phase, each=None):
             episodes[i].append(make_row(images[i], actions[i], rewards[i], bool(terminated[i])))
             if "success" in info:
                 success[i] = bool(success[i] or info["success"][i])
-        cut = bool(each and each(info["env_steps"][playing]))
-        playing &= ~(terminated | truncated | cut)
+        playing &= ~(terminated | truncated | bool(each and each(info["env_steps"][playing])))
     returns = [math.fsum(row["reward"] for row in rows) for rows in episodes]
     return list(zip(episodes, returns, success, strict=True))
 
@@ -1220,10 +1205,6 @@ def random_policy(seeds):
     rngs = [np.random.default_rng(seed) for seed in seeds]
     return lambda images, actions, state: (
         np.array([rng.uniform(-1, 1, actions.shape[1:]) for rng in rngs], np.float32), None)
-
-def agent_policy(agent, explore):
-    """The agent's actor: sampled when exploring, else its mode."""
-    return functools.partial(agent.act, explore=explore)
 
 # === Runs: folders, checkpoints, logs, and the training loop ======================================
 
@@ -1256,8 +1237,7 @@ class Run:
 
     def __init__(self, cfg, stage, fresh=False):
         if cfg.eta_delay < 0:
-            delay = cfg.eta_decay if family(cfg.src) != family(cfg.dst) else 0
-            cfg = replace(cfg, eta_delay=delay)
+            cfg = replace(cfg, eta_delay=cfg.eta_decay * (family(cfg.src) != family(cfg.dst)))
         self.cfg, self.stage, self.folder = cfg, stage, run_folder(cfg, stage)
         self.checkpoint = self.folder / "checkpoint.pt"
         self.log_path = self.folder / "metrics.jsonl"
@@ -1270,24 +1250,22 @@ class Run:
         for path in set(self.folder.iterdir()) - {self.folder / "lock"} if fresh else ():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         self.state = read_checkpoint(self.checkpoint) if self.checkpoint.exists() else None
-        old = self.state["config"] if self.state else cfg
-        differ = [f"{field.name} {getattr(old, field.name)} (now {getattr(cfg, field.name)})"
-                  for field in dataclasses.fields(Config) if not field.metadata["free"]
-                  and getattr(old, field.name) != getattr(cfg, field.name)]
+        old, new = vars(self.state["config"] if self.state else cfg), vars(cfg)
+        differ = [f"{f.name} {old[f.name]} (now {new[f.name]})" for f in dataclasses.fields(cfg)
+                  if old[f.name] != new[f.name] and not f.metadata["free"]]
         if differ:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
 
     def save(self, trainer):
         """Write the checkpoint, whole or not at all."""
-        config, cpu = dataclasses.asdict(self.cfg), torch.get_rng_state()
         cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
-        log_bytes = self.log_path.stat().st_size if self.log_path.exists() else 0
+        size = self.log_path.stat().st_size if self.log_path.exists() else 0
         buffer = io.BytesIO()  # a full disk is then an OSError of the file, not one inside torch
-        torch.save(dict(config=config, stage=self.stage, trainer=trainer.state_dict(),
-                        rng=dict(cpu=cpu, cuda=cuda), log_bytes=log_bytes), buffer)
+        torch.save(dict(config=vars(self.cfg), stage=self.stage, trainer=trainer.state_dict(),
+                        rng=dict(cpu=torch.get_rng_state(), cuda=cuda), log_bytes=size), buffer)
         with atomic(self.folder / "config.json") as file:
-            file.write(json.dumps(config, indent=2).encode())
+            file.write(json.dumps(vars(self.cfg), indent=2).encode())
         with atomic(self.checkpoint) as file:
             file.write(buffer.getbuffer())
 
@@ -1430,25 +1408,17 @@ class AgentTrainer(Trainer):
         self.progress = self.decisions = self.updates = self.episodes = 0
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
 
-    @property
-    def phase(self):
-        """The colours of an episode that starts now: they switch once, at the midpoint."""
-        return "train" if self.progress < self.switch_step else "shifted"
-
-    def updates_due(self, decisions):
-        """How many updates follow the decisions just made, one in each environment."""
-        cfg, before = self.cfg, self.decisions - decisions
+    def learn(self, env_steps):
+        """The updates due after a decision in each environment that plays → list of metrics."""
+        cfg, before, metrics = self.cfg, self.decisions, []
+        self.decisions += len(env_steps)
+        self.progress += int(env_steps.sum())
         if self.decisions < cfg.prefill or self.replay.rows < cfg.batch_length:
-            return 0
+            return metrics
         due = self.decisions // cfg.train_every - before // cfg.train_every
-        return due if self.updates else cfg.first_updates
-
-    def learn(self, decisions):
-        """Do the updates that are due after so many decisions → a list of their metrics."""
-        cfg, metrics = self.cfg, []
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
-        for _ in range(self.updates_due(decisions)):
+        for _ in range(due if self.updates else cfg.first_updates):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             self.batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
             probe = self.updates % 100 == 0
@@ -1461,45 +1431,42 @@ class AgentTrainer(Trainer):
         of the updates. It ends with the simulator's, at the colour switch, or with the run."""
         cfg, metrics, count = self.cfg, [], self.envs.num_envs
         seeds = [episode_seed(cfg.seed, TRAINING, self.episodes + i) for i in range(count)]
-        random, actor = random_policy(seeds), agent_policy(self.agent, explore=True)
-        limit = self.switch_step if self.progress < self.switch_step else self.total
+        random, actor = random_policy(seeds), functools.partial(self.agent.act, explore=True)
+        self.phase, limit = "shifted", self.total
+        if self.progress < self.switch_step:  # the colours switch once, at the midpoint
+            self.phase, limit = "train", self.switch_step
         def policy(*args):
             return (random if self.decisions < cfg.prefill else actor)(*args)
         def each(env_steps):
-            self.decisions += len(env_steps)
-            self.progress += int(env_steps.sum())
-            metrics.extend(self.learn(len(env_steps)))
+            metrics.extend(self.learn(env_steps))
             return self.progress >= limit
         return play_episodes(self.envs, policy, seeds, self.phase, each), metrics
 
     def advance(self):
         """An episode in each environment, and an evaluation when one is due → a row of the log."""
-        cfg, phase, before = self.cfg, self.phase, self.progress
+        cfg, start = self.cfg, self.progress
         self.replay.prune()           # a checkpoint was written: what only the one before needed
         episodes, metrics = self.play()
         self.episodes += len(episodes)
         rows, returns, success = zip(*episodes, strict=True)
         for episode in rows:
             self.replay.add(episode)
-        row = dict(step=self.progress, phase=phase, train_return=statistics.fmean(returns),
+        row = dict(step=self.progress, phase=self.phase, train_return=statistics.fmean(returns),
                    train_length=statistics.mean(len(episode) - 1 for episode in rows))
         row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
-        if None not in success:
-            row["train_success"] = statistics.fmean(success)
-        due = self.progress // cfg.eval_every > before // cfg.eval_every
-        if due or self.progress >= self.total:
+        row |= {} if None in success else dict(train_success=statistics.fmean(success))
+        if self.progress >= self.total or self.progress // cfg.eval_every > start // cfg.eval_every:
             apart = family(cfg.dst) == "drawer"  # its third table top is never trained on
-            result = evaluate_agent(cfg, self.agent, self.envs, "eval" if apart else phase)
+            result = evaluate_agent(cfg, self.agent, self.envs, "eval" if apart else self.phase)
             row["eval_return"] = result.pop("mean")
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
 
     def state_dict(self):
         """And the teacher, so that the run needs no other file."""
-        teacher = self.agent.teacher
-        if teacher:
-            teacher = dict(depth=teacher.net[0].out_channels, weights=teacher.state_dict())
-        return super().state_dict() | dict(teacher=teacher, action_dim=self.agent.action_dim)
+        net = self.agent.teacher
+        saved = dict(depth=net.net[0].out_channels, weights=net.state_dict()) if net else None
+        return super().state_dict() | dict(teacher=saved, action_dim=self.agent.action_dim)
 
 def evaluate_agent(cfg, agent, envs, phase, replay=None):
     """Play `eval_episodes` episodes into the replay, the same seeds every time; agent None: random.
@@ -1510,7 +1477,7 @@ def evaluate_agent(cfg, agent, envs, phase, replay=None):
         torch.manual_seed(cfg.seed)
         for first in range(0, cfg.eval_episodes, count):
             seeds = [episode_seed(cfg.seed, EVALUATION, first + i) for i in range(count)]
-            policy = agent_policy(agent, explore=False) if agent else random_policy(seeds)
+            policy = functools.partial(agent.act, explore=False) if agent else random_policy(seeds)
             episodes = play_episodes(envs, policy, seeds, phase)[:cfg.eval_episodes - first]
             played += [result for _, *result in episodes]
             for rows, *_ in episodes if replay else ():
