@@ -2038,7 +2038,7 @@ def parse_args(argv):
     parser = Parser(prog="diswm.py", description="Disentangled World Models.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, own in COMMANDS.items():
-        help = globals()[name].__doc__.split("\n")[0]
+        help = (globals()[name].__doc__ or name).split("\n")[0]              # -OO has none
         sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
         for flag in dict.fromkeys(["--preset", "--fresh", *own]):             # each once
             sub.add_argument(flag, **FLAGS[flag])
