@@ -1488,45 +1488,70 @@ def evaluate_agent(cfg, agent, envs, phase, replay=None):
 
 # === Stages =======================================================================================
 
-def announce(cfg, stage, folder, frames):
-    """What runs, on what, its needs and folder."""
-    disk = 0.1 + frames * 12.35e-6                                            # GB; a row is 12.3 kB
+def announce(run, frames):
+    """Say what runs, on what, its needs and folder."""
+    cfg, disk = run.cfg, 0.1 + frames * 12.35e-6                              # GB; a row is 12.3 kB
     memory = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5  # measured
     have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     if cfg.device == "cpu" and memory > have:
         raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
                         "take a smaller --batch-size, --batch-length or --cnn-depth")
-    print(f"{stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
+    print(f"{run.stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
           f"{cfg.precision} and {torch.get_num_threads()} threads\n  needs about {disk:.1f} GB of "
-          f"disk and {memory:.1f} GB of memory; results go to {folder}", flush=True)
+          f"disk and {memory:.1f} GB of memory; results go to {run.folder}", flush=True)
 
-def train_agent(cfg, stage, fresh):
-    """Train an agent in `cfg.dst` from where it stopped. Returns the run's folder."""
-    run, device = Run(cfg, stage, fresh), torch.device(cfg.device)
-    video = teacher = None
-    if run.state:
-        teacher = saved_teacher(run.state["trainer"], cfg, device)
-    elif cfg.eta > 0 or cfg.carry_over != "none":
-        video = find_teacher(cfg, device)
-        teacher = freeze(video.encoder) if cfg.eta > 0 else None
-    announce(cfg, stage, run.folder, cfg.steps // cfg.action_repeat)
-    torch.manual_seed(cfg.seed)
-    trainer = AgentTrainer(run.cfg, run.folder, device, teacher)
-    if video and cfg.carry_over != "none":
-        trainer.agent.model.carry_over(video)
-    with contextlib.closing(trainer.envs):
-        train(trainer, run)
-    return run.folder
+def load_model(path, device):
+    """The model of a checkpoint → (its cfg on `device`, Agent or VideoPredictor, the checkpoint)"""
+    state = read_checkpoint(path)
+    cfg, trainer = replace(state["config"], device=device.type, precision="fp32"), state["trainer"]
+    with reading(path):
+        if state["stage"] == "pretrain":
+            model, weights = VideoPredictor(cfg).to(device), trainer["model"]
+        else:
+            teacher = trainer["teacher"] and BetaVAEEncoder(cfg.z_dim, trainer["teacher"]["depth"])
+            if teacher:
+                freeze(teacher.to(device)).load_state_dict(trainer["teacher"]["weights"])
+            model, weights = Agent(cfg, trainer["action_dim"], device, teacher), trainer["agent"]
+        model.load_state_dict(weights)
+    return cfg, model, state
+
+def find_teacher(cfg, device):
+    """A video predictor to learn from: --teacher, or the one of --src and this method.
+    Prefers the run's own seed, else the first. Raises UserError with the command that makes one."""
+    own = run_folder(cfg, "pretrain")
+    found = [own / "checkpoint.pt", *sorted(own.parent.glob("seed*/checkpoint.pt"))]
+    path = Path(cfg.teacher) if cfg.teacher else next(filter(Path.exists, found), None)
+    command = f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method}"
+    if cfg.src == cfg.dst:
+        raise UserError(f"source and target are both {cfg.src}; choose another --src")
+    if path is None:
+        others = {p.parts[-4] for p in own.parent.parent.parent.glob(f"*/{cfg.method}/*/*.pt")}
+        more = f" (or take one that exists: --src {min(others)})" if others else ""
+        raise UserError(f"no teacher in {own.parent}; {command}{more}")
+    saved, model, state = load_model(path, device)
+    done = state["trainer"]["progress"]
+    if state["stage"] != "pretrain" or saved.encoder != ("beta_vae" if cfg.eta else cfg.encoder):
+        raise UserError(f"{path} is a {saved.encoder} {state['stage']} run, no teacher; {command}")
+    if saved.src == cfg.dst:
+        raise UserError(f"{path} saw videos of the target, {cfg.dst}; choose another --src")
+    carried = ("cnn_depth", "stoch", "deter", "hidden") if cfg.carry_over != "none" else ()
+    for name in ("z_dim", *carried):
+        if (size := getattr(saved, name)) != getattr(cfg, name):
+            raise UserError(f"{path} has another {name}; add --{name.replace('_', '-')} {size}")
+    if done < saved.pretrain_updates:
+        raise UserError(f"{path} is not finished ({done} of {saved.pretrain_updates}); {command}")
+    print(f"teacher: {path} ({saved.src}, {done:,} updates)")
+    return model
 
 def collect(cfg, fresh=False):
-    """Stage 1: DreamerV2 learns in the distracting source task; its replay is the video set."""
+    """Learn in the distracting source task; the replay is the video set (stage 1, DreamerV2)."""
     # The training colours throughout, and every frame is kept.
     cfg = replace(cfg, dst=cfg.src, method="dreamerv2", steps=cfg.collect_steps, switch=1.0,
                   replay_capacity=10 * cfg.collect_steps, **METHODS["dreamerv2"])
-    return train_agent(cfg, "collect", fresh)
+    return finetune(cfg, fresh, "collect")
 
 def pretrain(cfg, fresh=False):
-    """Stage 2: the video predictor. Collects videos first when there are none."""
+    """Train the β-VAE video predictor (stage 2; collects videos first if there are none)."""
     cfg = replace(cfg, dst=cfg.src)
     run, folder = Run(cfg, "pretrain", fresh), Path(cfg.videos)
     if not cfg.videos:
@@ -1539,82 +1564,41 @@ def pretrain(cfg, fresh=False):
         raise UserError(f"{folder} has {videos.rows} frames, less than one window of "
                         f"{cfg.batch_length}; collect more, or lower --batch-length")
     print(f"videos: {folder}, {len(videos.paths):,} episodes, {videos.rows:,} frames")
-    announce(cfg, "pretrain", run.folder, 0)
+    announce(run, 0)
     torch.manual_seed(cfg.seed)
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
-def finetune(cfg, fresh=False):
-    """Stage 3: distil, adapt, learn behaviour in the target task."""
-    train_agent(cfg, "finetune", fresh)
+def finetune(cfg, fresh=False, stage="finetune"):
+    """Distil, adapt and learn behaviour in the target task (stage 3).
+    Goes on from where it stopped; also what collect does. Returns the run's folder."""
+    run, device, video, teacher = Run(cfg, stage, fresh), torch.device(cfg.device), None, None
+    if run.state:
+        teacher = load_model(run.checkpoint, device)[1].teacher
+    elif cfg.eta > 0 or cfg.carry_over != "none":
+        video = find_teacher(cfg, device)
+        teacher = freeze(video.encoder) if cfg.eta > 0 else None
+    announce(run, cfg.steps // cfg.action_repeat)
+    torch.manual_seed(cfg.seed)
+    trainer = AgentTrainer(run.cfg, run.folder, device, teacher)
+    if video and cfg.carry_over != "none":
+        trainer.agent.model.carry_over(video)
+    with contextlib.closing(trainer.envs):
+        train(trainer, run)
+    return run.folder
 
-def find_teacher(cfg, device):
-    """A video predictor to learn from: --teacher, or the one of --src and this method.
-    Prefers the run's own seed, else the first. Raises UserError with the command that makes one."""
-    own = run_folder(cfg, "pretrain")
-    found = [own / "checkpoint.pt", *sorted(own.parent.glob("seed*/checkpoint.pt"))]
-    path = Path(cfg.teacher) if cfg.teacher else next((p for p in found if p.exists()), None)
-    command = f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method}"
-    if cfg.src == cfg.dst:
-        raise UserError(f"source and target are both {cfg.src}; choose another --src")
-    if path is None:
-        others = {p.parts[-4] for p in own.parent.parent.parent.glob(f"*/{cfg.method}/*/*.pt")}
-        raise UserError(f"no teacher in {own.parent}; {command}"
-                        + (f" (or take one that exists: --src {min(others)})" if others else ""))
-    state = read_checkpoint(path)
-    saved, done = state["config"], state["trainer"]["progress"]
-    if state["stage"] != "pretrain" or saved.encoder != ("beta_vae" if cfg.eta else cfg.encoder):
-        raise UserError(f"{path} is a {saved.encoder} {state['stage']} run, no teacher; {command}")
-    if saved.src == cfg.dst:
-        raise UserError(f"{path} saw videos of the target, {cfg.dst}; choose another --src")
-    more = () if cfg.carry_over == "none" else ("cnn_depth", "stoch", "deter", "hidden")
-    for name in ("z_dim", *more):
-        if (size := getattr(saved, name)) != getattr(cfg, name):
-            raise UserError(f"{path} has another {name}; add --{name.replace('_', '-')} {size}")
-    if done < saved.pretrain_updates:
-        raise UserError(f"{path} is not finished ({done} of {saved.pretrain_updates}); {command}")
-    print(f"teacher: {path} ({saved.src}, {done:,} updates)")
-    with reading(path):
-        model = VideoPredictor(saved)
-        model.load_state_dict(state["trainer"]["model"])
-    return model.to(device)
-
-def saved_teacher(trainer, cfg, device):
-    """The frozen teacher that an agent's checkpoint carries, or None."""
-    if not trainer["teacher"]:
-        return None
-    teacher = BetaVAEEncoder(cfg.z_dim, trainer["teacher"]["depth"]).to(device)
-    teacher.load_state_dict(trainer["teacher"]["weights"])
-    return freeze(teacher)
-
-def load_model(folder, device):
-    """A run's model from its checkpoint → (cfg, Agent or VideoPredictor, the trainer's state)."""
-    state = read_checkpoint(Path(folder) / "checkpoint.pt")
-    cfg, trainer = replace(state["config"], device=device.type, precision="fp32"), state["trainer"]
-    with reading(Path(folder) / "checkpoint.pt"):
-        if state["stage"] == "pretrain":
-            model, weights = VideoPredictor(cfg).to(device), trainer["model"]
-        else:
-            model = Agent(cfg, trainer["action_dim"], device, saved_teacher(trainer, cfg, device))
-            weights = trainer["agent"]
-        model.load_state_dict(weights)
-    return cfg, model, trainer
-
-def evaluate(folder, device, episodes=None):
-    """Stage 4: episodes with the actor's mode, and as many with random actions.
-    Writes evaluation.json, its episodes, and the first of them as evaluation.mp4."""
-    folder = Path(folder)
-    cfg, agent, trainer = load_model(folder, device)
+def evaluate(cfg, folder):
+    """Play episodes with a run's policy and with a random one; JSON and mp4 (stage 4).
+    The actor's mode acts. Writes evaluation.json, its episodes, and the first as evaluation.mp4."""
+    cfg, agent, state = load_model(folder / "checkpoint.pt", torch.device(cfg.device))
+    step = state["trainer"]["progress"]
     if not isinstance(agent, Agent):
         raise UserError(f"{folder} is a video predictor without a policy; give a finetune run")
-    cfg = replace(cfg, eval_episodes=episodes or cfg.eval_episodes)
-    switched = trainer["progress"] >= int(cfg.switch * cfg.steps) < cfg.steps
-    phase = "shifted" if switched else "train"
-    phase = "eval" if family(cfg.dst) == "drawer" else phase                  # as while it trained
-    result = dict(task=cfg.dst, phase=phase, step=trainer["progress"])
+    switched = step >= int(cfg.switch * cfg.steps) < cfg.steps                # as while it trained
+    phase = "eval" if family(cfg.dst) == "drawer" else "shifted" if switched else "train"
+    result = dict(task=cfg.dst, phase=phase, step=step)
     shutil.rmtree(folder / "evaluation", ignore_errors=True)
     replay, said = Replay(folder / "evaluation"), []
-    for name, policy in (("", agent), ("random_", None)):
-        # Nobody looks at what the random policy sees.
+    for name, policy in (("", agent), ("random_", None)):                  # which need not see
         with contextlib.closing(config_envs(cfg, cfg.dst, pixels=bool(policy))) as envs:
             more = evaluate_agent(cfg, policy, envs, phase, replay if policy else None)
         result |= {name + key: value for key, value in more.items()}
@@ -1623,7 +1607,7 @@ def evaluate(folder, device, episodes=None):
     frames = replay.window(0, replay.ends[0])["image"].repeat(4, 1).repeat(4, 2)
     iio.imwrite(folder / "evaluation.mp4", frames, fps=25)                    # 256 × 256
     (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
-    print(f"{cfg.dst}, {phase} colours, after {result['step']:,} env steps: return {said[0]}; "
+    print(f"{cfg.dst}, {phase} colours, after {step:,} env steps: return {said[0]}; "
           f"random policy: {said[1]}; {cfg.eval_episodes} episodes each\n"
           f"wrote evaluation.json, evaluation.mp4 and evaluation/*.npz in {folder}")
 
@@ -1670,8 +1654,8 @@ def labelled_frames(cfg):
     """Random episodes of `cfg.dst` whose colours are drawn anew for each frame, each channel by
     itself from the union of both phases' intervals. Returns images, uint8 (N, 64, 64, 3), factors
     (N, K): colours that show, joint positions, m, and angles, rad, in (−π, π]; and their names."""
-    images, factors, rng = [], [], np.random.default_rng(cfg.seed)
-    with contextlib.closing(config_env(replace(cfg, color_step_std=0.0), cfg.dst, "none")) as env:
+    images, factors, ends, rng = [], [], [], np.random.default_rng(cfg.seed)
+    with contextlib.closing(config_env(cfg, cfg.dst, "none")) as env:
         model, data, painter = env.unwrapped.model, env.unwrapped.data, env.env
         original = np.array([rgb[0] for rgb in painter.original]).reshape(-1, 3)
         boxes = [color_box(phase, original, cfg.colors, cfg.color_range) for phase in PHASES[:2]]
@@ -1680,13 +1664,11 @@ def labelled_frames(cfg):
             return env.render()
         shown = [group for group in range(len(original))
                  if (rendered(group, 0) != rendered(group, 1)).any()]
-        over = True
-        while len(factors) < FRAMES:
-            if over:
-                env.reset(seed=episode_seed(cfg.seed, EVALUATION, len(factors)))
+        for index in range(FRAMES):
+            if index % DECISIONS == 0 or any(ends):
+                env.reset(seed=episode_seed(cfg.seed, EVALUATION, index))
             painter.paint(rng.uniform(np.min(boxes, 0)[0], np.max(boxes, 0)[1]))
             image, _, *ends, _ = env.step(rng.uniform(-1, 1, env.action_space.shape))
-            over = any(ends) or len(factors) % DECISIONS == DECISIONS - 1
             images.append(image)
             factors.append(np.concatenate([painter.current[shown].ravel(), data.qpos]))
     names = [f"{painter.groups[group][0]} colour ({channel})" for group in shown
@@ -1705,20 +1687,19 @@ def disentanglement(codes, factors):
     `informativeness`. Returns a dict of scores, and each latent's share of each R², (K, Z)."""
     from scipy.stats import entropy  # slow to import
     from sklearn.ensemble import GradientBoostingRegressor
-    n, importance, r2, information = len(codes) * 3 // 4, [], [], []
+    n, importance, r2, mutual = len(codes) * 3 // 4, [], [], []
     for factor in factors.T:
         trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
         importance.append(trees.feature_importances_ + 1e-12)
         r2.append([max(0.0, trees.score(codes[n:], factor[n:]))])
         tables = [np.histogram2d(factor, code, 20)[0] for code in codes.T]
-        # I(z; f) / H(f), less 1, which the gap between the two best does not see.
         shared = [entropy(table.sum(0)) - entropy(table.ravel()) for table in tables]
-        information.append(np.sort(shared) / entropy(tables[0].sum(1)))
+        mutual.append(np.sort(shared) / entropy(tables[0].sum(1)))  # I/H − 1: gaps do not see the 1
     of_latents = 1 - entropy(importance, base=max(2, factors.shape[1]), axis=0)       # (Z,)
     of_factors = 1 - entropy(importance, base=max(2, codes.shape[1]), axis=1)         # (K,)
     return dict(disentanglement=np.average(of_latents, weights=np.sum(importance, 0)),
                 completeness=of_factors.mean(), informativeness=np.mean(r2),
-                mig=np.ptp(np.array(information)[:, -2:], 1).mean()), np.multiply(importance, r2)
+                mig=np.ptp(np.array(mutual)[:, -2:], 1).mean()), np.multiply(importance, r2)
 
 @torch.no_grad()
 def measure(cfg, model, teacher, path):
@@ -1728,9 +1709,8 @@ def measure(cfg, model, teacher, path):
     frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
     torch.manual_seed(cfg.seed)                                               # as training began
     start = type(model)(cfg, model.rssm.action_dim).to(cfg.device)
-    encoders = (dict(teacher=teacher) if teacher else {}) | dict(
-        start=start.encoder, end=model.encoder)
-    for name, encoder in encoders.items():
+    encoders = dict(teacher=teacher, start=start.encoder, end=model.encoder)
+    for name, encoder in encoders.items() if teacher else [*encoders.items()][1:]:
         codes = torch.cat([encoder(preprocess(part.to(cfg.device)))[0].cpu() for part in frames])
         scores, share = disentanglement(codes.numpy(), factors)
         result[name] = scores | dict(share=share.tolist())
@@ -1744,27 +1724,26 @@ def draw_grid(pictures, rows, columns, path, title=""):
     r, c = pictures.shape[:2]
     axes = Figure(figsize=(c * 0.75 + 1, r * 0.75 + 0.5)).subplots()
     axes.imshow(pictures.transpose(0, 2, 1, 3, 4).reshape(r * 64, c * 64, 3))
-    axes.set_yticks(np.arange(r) * 64 + 32, rows)
-    axes.set_xticks(np.arange(c) * 64 + 32, columns)
+    axes.set(title=title, frame_on=False, yticks=np.arange(r) * 64 + 32, yticklabels=rows,
+             xticks=np.arange(c) * 64 + 32, xticklabels=columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.set(title=title, frame_on=False)
     axes.figure.savefig(path, dpi=100, bbox_inches="tight")
     print(f"wrote {path}")
 
-def traverse(folder, device, videos="", metrics=False):
-    """Draw traversal.png (for models with β-VAE latents) and open_loop.png into a run's folder.
-    metrics: also write disentanglement.json, and name what each latent of the picture follows.
-    Episodes: `videos`, else the run's, else those collected beside it: none that a checkpoint,
-    which may be a stranger's, could name."""
-    folder = Path(folder)
-    cfg, model, _ = load_model(folder, device)
-    online, (*_, source, _, _) = isinstance(model, Agent), ("", "", *folder.resolve().parts)
-    places = [folder / "videos",
-              *(folder / "../../../..").glob(f"collect/{source}/*/seed*/episodes")]
-    place = Path(videos) if videos else next(filter(Path.exists, places), places[0])
-    replay = Replay(folder / "episodes") if online else Replay(place, keys=VIDEO_KEYS)
-    teacher, model = (model.teacher, model.model) if online else (None, model)
-    cfg = cfg if online else replace(cfg, dst=cfg.src)                        # also of old runs
+def traverse(cfg, folder, metrics=False):
+    """Draw latent traversals and open-loop predictions of a run.
+    traversal.png (of β-VAE latents), open_loop.png; metrics: also disentanglement.json, and in the
+    picture what each latent follows. Episodes: an agent's own; a predictor's --videos, else its
+    own, else those collected beside it: none that a checkpoint, maybe a stranger's, could name."""
+    videos, device = cfg.videos, torch.device(cfg.device)
+    cfg, model, _ = load_model(folder / "checkpoint.pt", device)
+    if isinstance(model, Agent):
+        replay, teacher, model = Replay(folder / "episodes"), model.teacher, model.model
+    else:
+        source = folder.resolve().parent.parent.name
+        places = [folder / "videos", *folder.glob(f"../../../../collect/{source}/*/seed*/episodes")]
+        replay = Replay(videos or next(filter(Path.exists, places), places[0]), keys=VIDEO_KEYS)
+        teacher, cfg = None, replace(cfg, dst=cfg.src)                        # also of old runs
     if metrics and cfg.encoder != "beta_vae":
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
@@ -1774,23 +1753,21 @@ def traverse(folder, device, videos="", metrics=False):
     window = replay.window(start, min(50, replay.rows - start))
     window["is_first"][0] = True
     batch = to_device({key: value[None] for key, value in window.items()}, device)
-    with torch.random.fork_rng():
-        torch.manual_seed(cfg.seed)
-        strip = open_loop(model, batch)
-        frames = range(0, strip.shape[1], 4)
-        draw_grid(strip[:, ::4], ("truth", "model", "error"), frames, folder / "open_loop.png",
-                  "open-loop prediction: frames 5 … are predicted, not seen")
-        if cfg.encoder == "beta_vae" and not isinstance(model.rssm, StackedRSSM):
-            pictures, nats = latent_traversal(model, batch)
-            order, path = np.argsort(-nats), folder / "disentanglement.json"  # informative first
-            follows = measure(cfg, model, teacher, path) if metrics else [""] * len(nats)
-            draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats  {follows[i]}" for i in order],
-                      ["recon.", *TRAVERSAL], folder / "traversal.png")
+    torch.manual_seed(cfg.seed)
+    strip = open_loop(model, batch)
+    draw_grid(strip[:, ::4], ("truth", "model", "error"), range(0, strip.shape[1], 4),
+              folder / "open_loop.png", "open-loop prediction: frames 5 … are predicted, not seen")
+    if cfg.encoder == "beta_vae" and not isinstance(model.rssm, StackedRSSM):
+        pictures, nats = latent_traversal(model, batch)
+        order, path = np.argsort(-nats), folder / "disentanglement.json"      # informative first
+        follows = measure(cfg, model, teacher, path) if metrics else [""] * len(nats)
+        draw_grid(pictures[order], [f"z{i}  {nats[i]:.2f} nats  {follows[i]}" for i in order],
+                  ["recon.", *TRAVERSAL], folder / "traversal.png")
 
 def read_log(folder):
     """A run's metrics.jsonl → list of dicts; empty when there is none.
     A last line without its end is left out: it is being written, or was cut off."""
-    path = Path(folder) / "metrics.jsonl"
+    path = folder / "metrics.jsonl"
     with reading(path, "log of ours", "remove it"):
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
         rows = [json.loads(line) for line in lines]
@@ -1815,31 +1792,30 @@ def curve_figures(runs, switch=None):
     if switch and steps[0] <= switch < steps[-1]:
         after = np.searchsorted(steps, switch, "right")
         figures |= dict(before=values[:, after - 1], after=values[:, after])
-    def iqm(values, axis=0):
-        return trim_mean(values, 0.25, axis)
+    iqm = functools.partial(trim_mean, proportiontocut=0.25)
     for name, values in figures.items():
         interval = bootstrap([values], iqm, n_resamples=50_000, batch=5000, method="percentile",
                              rng=0).confidence_interval if len(runs) > 1 else ()
         figures[name] = [estimate.tolist() for estimate in (iqm(values), *interval)]
     return dict(seeds=len(runs), steps=steps, switch=switch) | figures
 
-def plot(folders, path):
-    """Evaluation returns of runs …/<tasks>/<method>/seed<k>: interquartile mean, 95 % interval.
-    Draws them, prints `curve_figures`, and writes these beside the picture as JSON."""
+def plot(cfg, folders, path):
+    """Draw learning curves of runs.
+    Evaluation returns of …/<tasks>/<method>/seed<k>: interquartile mean, 95 % interval. Prints
+    `curve_figures`, and writes these beside the picture as JSON."""
     from matplotlib.figure import Figure  # slow to import
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
-    for folder in map(Path, folders):
+    for folder in folders or sorted(Path(cfg.runs).glob("finetune/*/*/seed*")):
         rows = read_log(folder)
-        curve = {row["step"]: row["eval_return"] for row in rows if "eval_return" in row}
-        if curve:
-            *_, tasks, method, _ = folder.resolve().parts
+        if curve := {row["step"]: row["eval_return"] for row in rows if "eval_return" in row}:
+            tasks, method, _ = folder.resolve().parts[-3:]
             curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
             last = {row["phase"]: row["step"] for row in rows}                # of each phase
             if len(last) > 1:
                 switches[tasks] = last["train"]
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
-    figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), Path(path)
+    figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), path or Path(cfg.runs) / "curves.png"
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
         for method, runs in sorted(methods.items()):
@@ -1849,8 +1825,8 @@ def plot(folders, path):
             line, = axes.plot(steps, mean, marker=".", label=label)
             if interval:
                 axes.fill_between(steps, *interval, alpha=0.2, color=line.get_color())
-            print(f"{tasks}: {label}", *(f"{name} {np.round(value, 1).tolist()}" for name, value
-                                         in figures.items() if name in CURVE), sep=", ")
+            print(f"{tasks}: {label}", *(f"{name} {np.round(figures[name], 1).tolist()}"
+                                         for name in CURVE if name in figures), sep=", ")
         if tasks in switches:
             axes.axvline(switches[tasks], color="gray", ls=":", label="the colours change")
         axes.set(title=re.sub(r"-(?!v\d)", " → ", tasks), ylim=(0, None),      # Hopper-v5
@@ -1867,15 +1843,14 @@ def plot(folders, path):
 def machine(cfg):
     """What runs here, and on what."""
     versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
-    versions["python"] = platform.python_version()
     return dict(device=cfg.device, precision=cfg.precision, threads=torch.get_num_threads(),
-                gl=os.environ["MUJOCO_GL"], versions=versions)
+                gl=os.environ["MUJOCO_GL"], versions=versions | dict(python=sys.version.split()[0]))
 
 def show(result):
     """Print a dict of dicts, a line for each value."""
     for name, value in result.items():
         for part, number in value.items() if isinstance(value, dict) else [("", value)]:
-            print(f"{name + ' ' + part:30}", f"{number:.4g}" if type(number) is float else number)
+            print(f"{f'{name} {part}':30}", f"{number:.4g}" if type(number) is float else number)
 
 def family_tasks(cfg):
     """A task of each family."""
@@ -1883,21 +1858,20 @@ def family_tasks(cfg):
     return dmc, "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5"
 
 def doctor(cfg):
-    """Print versions and device; render a frame of each family of tasks in each phase, doctor.png.
-    Raises UserError, once all have been tried, where one does not render."""
+    """Check rendering and versions.
+    doctor.png: a frame of each family in each phase. Raises UserError, last, if one fails."""
     show(machine(cfg))
-    rows, failed = [], []
-    for task in family_tasks(cfg):
+    tasks, failed, path = family_tasks(cfg), [], Path(cfg.runs) / "doctor.png"
+    pictures = np.full((len(tasks), len(PHASES), 64, 64, 3), 128, np.uint8)   # grey: has failed
+    for row, task in zip(pictures, tasks, strict=True):
         try:
             with contextlib.closing(config_env(cfg, task, "none")) as env:
-                rows.append([env.reset(seed=cfg.seed, options=dict(phase=phase))[0]
-                             for phase in PHASES])
+                row[:] = [env.reset(seed=cfg.seed, options=dict(phase=p))[0] for p in PHASES]
         except UserError as error:
             print(f"{task}: {error}")
             failed.append(task)
-            rows.append([np.full((64, 64, 3), 128, np.uint8)] * len(PHASES))
-    Path(cfg.runs).mkdir(parents=True, exist_ok=True)
-    draw_grid(np.array(rows), family_tasks(cfg), PHASES, Path(cfg.runs) / "doctor.png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draw_grid(pictures, tasks, PHASES, path)
     if failed:
         raise UserError(f"{', '.join(failed)} cannot be rendered; the causes stand above")
 
@@ -1905,65 +1879,63 @@ def median_s(function, repeats):
     """Median wall time of a call, after one to warm up."""
     return statistics.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
 
-def parameter_counts(agent):
-    """Numbers of parameters by part, and in total."""
-    parts = dict(world_model=agent.model, teacher=agent.teacher, actor=agent.behaviour.actor,
-                 critic=agent.behaviour.critic, slow_critic=agent.behaviour.slow_critic)
-    counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
-    return counts | dict(total=sum(counts.values()))
-
-def bench(cfg, repeats=5, scaling=False):
-    """Time an update, a pretraining update, the drawing of a batch; in each family of tasks a frame
-    and a decision. Count parameters. scaling: also time the update at four batch sizes and four
-    horizons, and fit the exponent of its growth. Returns a dict of names with units."""
+def bench(cfg, as_json=False, scaling=False, repeats=5):
+    """Time the steps, count the parameters.
+    An update, a pretraining update, drawing a batch; in each family of tasks a frame, a decision.
+    scaling: also the update at four batch sizes and horizons, and the exponent of its growth."""
     device, rng, result = torch.device(cfg.device), np.random.default_rng(0), machine(cfg)
     result |= {name: getattr(cfg, name) for name in ("method", "batch_size", "batch_length")}
-    def agent_for(cfg, actions):
-        teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
-        return Agent(cfg, actions, device, teacher)
+    teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
+    def update_s(cfg, learner, *args):
+        data = replay.sample(cfg.batch_size, cfg.batch_length, rng)
+        return median_s(lambda: mean_metrics([learner.update(data, *args)]), max(1, repeats))
     with contextlib.closing(config_env(cfg, cfg.dst, "none", pixels=False)) as env:
         actions = env.action_space.shape[0]
     with tempfile.TemporaryDirectory() as folder:
         replay = Replay(folder)
         noise = rng.integers(0, 256, (max(1000, cfg.batch_length), 64, 64, 3), np.uint8)
         replay.add([make_row(image, rng.uniform(-1, 1, actions)) for image in noise])
-        def batch(cfg):
-            return replay.sample(cfg.batch_size, cfg.batch_length, rng)
-        def step_s(cfg):
-            agent, data = agent_for(cfg, actions), batch(cfg)
-            return median_s(lambda: mean_metrics([agent.update(data, cfg.eta, 1)]), repeats)
-        result |= dict(train_step_s=step_s(cfg), sample_ms=1e3 * median_s(lambda: batch(cfg), 20))
-        videos, data = VideoTrainer(cfg, None, device), batch(cfg)
-        result["pretrain_step_s"] = median_s(lambda: mean_metrics([videos.update(data)]), repeats)
+        result["train_step_s"] = update_s(cfg, Agent(cfg, actions, device, teacher), cfg.eta, 1)
+        result["sample_ms"] = 1e3 * median_s(
+            lambda: replay.sample(cfg.batch_size, cfg.batch_length, rng), 20)
+        result["pretrain_step_s"] = update_s(cfg, VideoTrainer(cfg, None, device))
         result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         for name in ("batch_size", "horizon") if scaling else ():
-            values = [math.ceil(getattr(cfg, name) * part / 4) for part in (1, 2, 3, 4)]
-            times = [step_s(replace(cfg, **{name: value})) for value in values]
-            exponent = float(np.polyfit(np.log(values), np.log(times), 1)[0])
-            result[f"{name}_scaling"] = dict(zip(map(str, values), times, strict=True)) | dict(
-                exponent=exponent)
-    result["params"] = parameter_counts(agent_for(cfg, actions))
-    result |= dict(frame_ms={}, decision_ms={})
+            sizes = [math.ceil(getattr(cfg, name) * part / 4) for part in (1, 2, 3, 4)]
+            cfgs = [replace(cfg, **{name: size}) for size in sizes]
+            times = [update_s(c, Agent(c, actions, device, teacher), c.eta, 1) for c in cfgs]
+            growth = dict(exponent=float(np.polyfit(np.log(sizes), np.log(times), 1)[0]))
+            result[f"{name}_scaling"] = dict(zip(map(str, sizes), times, strict=True)) | growth
+    agent = Agent(cfg, actions, device, teacher)
+    parts = dict(world_model=agent.model, teacher=agent.teacher)
+    parts |= agent.behaviour.named_children()                                 # actor and critics
+    counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
+    result |= dict(params=counts | dict(total=sum(counts.values())), frame_ms={}, decision_ms={})
     for task in family_tasks(cfg):
         with contextlib.closing(config_env(cfg, task, "train")) as env:
-            agent = agent_for(cfg, env.action_space.shape[0])
+            agent = Agent(cfg, env.action_space.shape[0], device, teacher)
             seen = env.render()[None], np.zeros((1, agent.action_dim), np.float32), None
             result["frame_ms"][task] = 1e3 * median_s(env.render, 50)
             result["decision_ms"][task] = 1e3 * median_s(
                 lambda env=env, agent=agent, seen=seen: env.step(agent.act(*seen, True)[0][0]), 50)
-    return result
+    print(json.dumps(result)) if as_json else show(result)
 
 # === Command line =================================================================================
 
-COMMANDS = dict(
-    collect="learn in the distracting source task; the replay is the video set",
-    pretrain="train the β-VAE video predictor (collects videos first if there are none)",
-    finetune="distil, adapt and learn behaviour in the target task",
-    evaluate="play episodes with a run's policy and with a random one; JSON and mp4",
-    traverse="draw latent traversals and open-loop predictions of a run",
-    plot="draw learning curves of runs",
-    doctor="check rendering and versions",
-    bench="time the steps, count the parameters")
+COMMANDS = dict(  # and the flags that their functions take after cfg, in that order
+    collect=["--fresh"], pretrain=["--fresh"], finetune=["--fresh"], evaluate=["--run"],
+    traverse=["--run", "--metrics"], plot=["run", "--out"], doctor=[],
+    bench=["--json", "--scaling", "--repeats"])
+FLAGS = {  # beside those of Config
+    "--preset": dict(choices=PRESETS, help="default: paper on CUDA, else small"),
+    "--fresh": dict(action="store_true", help="start over instead of resuming"),
+    "--run": dict(type=Path, required=True, help="folder of a run: runs/…/seed0"),
+    "--metrics": dict(action="store_true", help="also measure disentanglement"),
+    "run": dict(type=Path, nargs="*", help="folders of runs; default: all finetune runs"),
+    "--out": dict(type=Path, help="PNG to write; default: curves.png in --runs"),
+    "--json": dict(action="store_true", help="print one JSON object"),
+    "--scaling": dict(action="store_true", help="how an update's cost grows"),
+    "--repeats": dict(type=int, default=5, help="updates to take the median of")}
 
 class Parser(argparse.ArgumentParser):
     """argparse whose errors are one line; that of an unknown flag lists what exists."""
@@ -1973,94 +1945,61 @@ class Parser(argparse.ArgumentParser):
         hint = f"there are: {flags}" if "unrecognized" in message else f"see: {self.prog} --help"
         self.exit(2, " ".join(f"error: {message}; {hint}".split()) + "\n")
 
-def add_config_flags(parser):
-    """A flag for every field of Config; only those given end up in the namespace."""
-    for field in dataclasses.fields(Config):
-        meta, kind = field.metadata, type(field.default)
-        choices = METHODS if field.name == "method" else meta["choices"]
-        options = dict(action=argparse.BooleanOptionalAction) if kind is bool else dict(
-            choices=choices, type=kind, metavar=None if choices else kind.__name__.upper())
-        parser.add_argument("--" + field.name.strip("_").replace("_", "-"), dest=field.name,
-                            default=argparse.SUPPRESS, **options,
-                            help=f"{meta['help']}; paper preset: {field.default or 'none'}")
-
 def parse_args(argv):
-    """The command line → (args, Config): a preset, then the method's values, then flags given."""
+    """The command line → (function, Config, more arguments). Config: preset, then method, flags."""
     parser = Parser(prog="diswm.py", description="Disentangled World Models.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, help in COMMANDS.items():
+    for name, own in COMMANDS.items():
+        help = (globals()[name].__doc__ or name).split("\n")[0]              # -OO has none
         sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
-        sub.add_argument("--preset", choices=PRESETS, help="default: paper on CUDA, else small")
-        sub.add_argument("--fresh", action="store_true", help="start over instead of resuming")
-        if name in ("evaluate", "traverse"):
-            sub.add_argument("--run", required=True, help="folder of a run: runs/…/seed0")
-        if name == "traverse":
-            sub.add_argument("--metrics", action="store_true", help="also measure disentanglement")
-        if name == "bench":
-            sub.add_argument("--json", action="store_true", help="print one JSON object")
-            sub.add_argument("--scaling", action="store_true", help="how an update's cost grows")
-            sub.add_argument("--repeats", type=int, default=5, help="updates to take the median of")
-        if name == "plot":
-            sub.add_argument("run", nargs="*", help="folders of runs; default: all finetune runs")
-            sub.add_argument("--out", help="PNG to write; default: curves.png in --runs")
-        add_config_flags(sub)
+        for flag in dict.fromkeys(["--preset", "--fresh", *own]):             # each once
+            sub.add_argument(flag, **FLAGS[flag])
+        for field in dataclasses.fields(Config):
+            meta, kind = field.metadata, type(field.default)
+            choices = METHODS if field.name == "method" else meta["choices"]
+            options = dict(action=argparse.BooleanOptionalAction) if kind is bool else dict(
+                choices=choices, type=kind, metavar=None if choices else kind.__name__.upper())
+            sub.add_argument("--" + field.name.strip("_").replace("_", "-"), dest=field.name,
+                             default=argparse.SUPPRESS, **options,
+                             help=f"{meta['help']}; paper preset: {field.default or 'none'}")
     args, unknown = parser.parse_known_args(argv)
+    args, refuse = vars(args), commands.choices[args.command].error
     if unknown:
-        commands.choices[args.command].error(f"unrecognized arguments: {' '.join(unknown)}")
-    given = {key: value for key, value in vars(args).items() if key in Config.__dataclass_fields__}
-    preset = args.preset or ("paper" if torch.cuda.is_available() else "small")
+        refuse(f"unrecognized arguments: {' '.join(unknown)}")
+    given = {key: value for key, value in args.items() if key in Config.__dataclass_fields__}
+    preset = args["preset"] or ("paper" if torch.cuda.is_available() else "small")
     try:
         cfg = replace(PRESETS[preset], **METHODS[given.get("method", "diswm")] | given)
     except ValueError as error:
-        commands.choices[args.command].error(str(error))
-    if not args.preset and args.command in ("collect", "pretrain", "finetune"):
+        refuse(str(error))
+    own = COMMANDS[args["command"]]
+    if not args["preset"] and "--fresh" in own:
         print(f"preset {preset}; --preset chooses another: {', '.join(PRESETS)}")
     for task in (cfg.src, cfg.dst):
         check_task(task)
-    return args, cfg
+    return globals()[args["command"]], cfg, [args[flag.strip("-")] for flag in own]
 
 def prepare_machine(cfg):
     """Decide what is "auto", and set torch up. Returns the Config with the decisions."""
     gpu = torch.cuda.is_available()
-    device = cfg.device if cfg.device != "auto" else "cuda" if gpu else "cpu"
+    device = cfg.device.replace("auto", "cuda" if gpu else "cpu")
     if device == "cuda" and not gpu:
         raise UserError("there is no CUDA device; use --device cpu")
     cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     native = device == "cuda" or "avx512_bf16" in cpuinfo or "amx_bf16" in cpuinfo
-    precision = cfg.precision if cfg.precision != "auto" else "bf16" if native else "fp32"
+    precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     torch.set_num_threads(cfg.threads or os.cpu_count())
     if platform.libc_ver()[0] == "glibc":
         # Large buffers go back to the kernel each step otherwise: 1.9× of a step at 50 × 50.
-        libc = ctypes.CDLL("libc.so.6")
-        libc.mallopt(-3, 1 << 30)                                             # mmap threshold
-        libc.mallopt(-1, (1 << 31) - 1)                                       # trim threshold
+        for threshold, value in ((-3, 1 << 30), (-1, (1 << 31) - 1)):         # mmap's, trim's
+            ctypes.CDLL("libc.so.6").mallopt(threshold, value)
     return replace(cfg, device=device, precision=precision)
-
-def run_command(argv):
-    args, cfg = parse_args(argv)
-    cfg, command = prepare_machine(cfg), globals()[args.command]
-    if command in (collect, pretrain, finetune):
-        command(cfg, args.fresh)
-    elif command is evaluate:
-        evaluate(args.run, torch.device(cfg.device))
-    elif command is traverse:
-        traverse(args.run, torch.device(cfg.device), cfg.videos, args.metrics)
-    elif command is plot:
-        runs = Path(cfg.runs)
-        plot(args.run or sorted(runs.glob("finetune/*/*/seed*")), args.out or runs / "curves.png")
-    elif command is bench:
-        result = bench(cfg, max(1, args.repeats), args.scaling)
-        if args.json:
-            print(json.dumps(result))
-        else:
-            show(result)
-    else:
-        command(cfg)
 
 def main(argv=None):
     """Run a command. A user's mistake is one line and exit code 1 or 2. Returns the exit code."""
     try:
-        run_command(argv)
+        command, cfg, own = parse_args(argv)
+        command(prepare_machine(cfg), *own)
         return 0
     except UserError as error:
         message, code = str(error), error.code

@@ -1126,7 +1126,7 @@ def test_padded_actions_are_zero_in_the_model_and_reach_nothing_else():
 def test_collecting_is_dreamerv2_whichever_method_asks_for_videos(method, monkeypatch):
     """One video set serves all methods: nothing of theirs may reach the agent that collects."""
     asked = []
-    monkeypatch.setattr(diswm, "train_agent", lambda cfg, *args: asked.append(cfg))
+    monkeypatch.setattr(diswm, "finetune", lambda cfg, *args: asked.append(cfg))
     for name in (method, "dreamerv2"):
         diswm.collect(tiny_config(name))
     assert asked[0] == asked[1] and asked[0].carry_over == "none" and asked[0].eta == 0
@@ -2194,13 +2194,13 @@ def test_materials_that_do_not_show_are_no_factors(few_frames):
 
 
 def test_start_encoder_is_the_first_checkpoint_bit_for_bit(teacher, tmp_path, monkeypatch):
-    """--metrics builds it anew from the seed; it must be what train_agent began with."""
+    """--metrics builds it anew from the seed; it must be what finetune began with."""
     argv = cut_command(teacher, tmp_path)
     interrupt(diswm.ActionRepeat, "step", 10, argv)
     folder = next(tmp_path.rglob("checkpoint.pt")).parent
     saved = torch.load(folder / "checkpoint.pt", weights_only=True)["trainer"]
     assert saved["progress"] == 0
-    cfg, agent, _ = diswm.load_model(folder, CPU)
+    cfg, agent, _ = diswm.load_model(folder / "checkpoint.pt", CPU)
     seen = []
     monkeypatch.setattr(diswm, "labelled_frames", lambda cfg: (
         np.zeros((8, 64, 64, 3), np.uint8), uniform_factors(2, 8), ["a", "b"]))
@@ -3150,7 +3150,7 @@ def test_spoilt_checkpoint_of_a_video_predictor_is_one_line(teacher, root, data)
         torch.save(state, run / "checkpoint.pt")
         cfg = tiny_config(runs=runs, teacher=str(run / "checkpoint.pt"))
         one_line_or_none(diswm.find_teacher, cfg, CPU)
-        one_line_or_none(diswm.load_model, run, CPU)
+        one_line_or_none(diswm.load_model, run / "checkpoint.pt", CPU)
         code, _, err = run_cli(*pretrain_command(root, runs, 20))
         assert code == 0 or (code == 1 and err.startswith("error: ") and err.count("\n") == 1), err
 
@@ -3164,7 +3164,7 @@ def test_spoilt_checkpoint_of_an_agent_is_one_line(finished, data):
         state = torch.load(finished / "checkpoint.pt", weights_only=True)
         spoil(state, data)
         torch.save(state, run / "checkpoint.pt")
-        one_line_or_none(diswm.load_model, run, CPU)
+        one_line_or_none(diswm.load_model, run / "checkpoint.pt", CPU)
 
 
 @pytest.mark.parametrize("spoilt", ["model", "optimizer"])
