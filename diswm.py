@@ -167,6 +167,7 @@ class Config:
     precision: str = flag("auto", "of convolutions and MLPs; auto: bf16 where native (ours)",
                           ("auto", "fp32", "bf16"), free=True)
     threads: int = flag(0, "CPU threads; 0: one per core (ours)", high=1024, free=True)
+    compile: bool = flag(False, "torch.compile model and imagination, for GPUs (ours)", free=True)
 
     def __post_init__(self):
         """Raises ValueError at wrong types and values out of range, also those of a checkpoint."""
@@ -505,7 +506,7 @@ class VideoPredictor(nn.Module):
         teacher: dict of embed, mean, logvar of the same images from the frozen teacher, or None."""
         cfg, code, terms = self.cfg, out["code"], self.terms(out, batch)
         loss, kl = rssm_kl_loss(out["post"], out["prior"], cfg.kl_balance, cfg.free_nats)
-        metrics = dict(kl_loss=loss, kl=kl.mean(), eta=torch.tensor(eta),
+        metrics = dict(kl_loss=loss, kl=kl.mean(), eta=loss.new_full((), eta),
                        post_entropy=normal_entropy(out["post"]["std"]).mean(),
                        prior_entropy=normal_entropy(out["prior"]["std"]).mean())
         loss = self.scales["kl"] * loss
@@ -637,22 +638,30 @@ def autocast(cfg):  # 1.5× of a whole step on a CPU with native bf16
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
 
 def to_device(batch, device):
-    """Numpy arrays → tensors on the device, images preprocessed."""
-    batch = {key: torch.from_numpy(value).to(device) for key, value in batch.items()}
+    """Numpy arrays → tensors on the device, images preprocessed. A GPU copies pinned memory."""
+    batch = {key: torch.from_numpy(value) for key, value in batch.items()}
+    if device.type == "cuda":
+        batch = {key: value.pin_memory() for key, value in batch.items()}
+    batch = {key: value.to(device, non_blocking=True) for key, value in batch.items()}
     return batch | {"image": preprocess(batch["image"])}
 
-def gradient_step(optimizer, loss, metrics, clip):
-    """Minimise loss over the optimiser's own parameters. Returns the gradient norm before clipping.
-    Raises FloatingPointError at a non-finite loss or gradient, before it changes anything."""
+def gradient_step(optimizer, loss, clip):
+    """Minimise loss over the optimiser's own parameters. Returns their gradient norm, unclipped."""
     parameters = optimizer.param_groups[0]["params"]
     optimizer.zero_grad()
     loss.backward(inputs=parameters)  # the actor's graph runs through the model, which gets none
     norm = nn.utils.clip_grad_norm_(parameters, clip)
-    if not torch.isfinite(loss + norm):
-        bad = [key for key, value in metrics.items() if not torch.isfinite(value).all()]
-        raise FloatingPointError(f"non-finite {', '.join(bad) or f'gradient, its norm is {norm}'}")
     optimizer.step()
     return norm
+
+def check_finite(metrics):
+    """Raises FloatingPointError, which names the first that are not, unless all of an update's
+    metrics are finite. Waits for a GPU, once an update."""
+    finite = torch.stack(list(metrics.values())).isfinite().tolist()
+    bad = [name for name, good in zip(metrics, finite, strict=True) if not good]
+    if bad:
+        raise FloatingPointError(f"non-finite {', '.join(bad[:3])}")
+    return metrics
 
 class Agent:
     """World model, actor-critic, frozen teacher and optimisers: what an online run trains."""
@@ -664,6 +673,9 @@ class Agent:
         self.optimizers = dict(model=Adam(self.model, cfg.model_lr),
                                actor=Adam(self.behaviour.actor, cfg.actor_lr),
                                critic=Adam(self.behaviour.critic, cfg.critic_lr))
+        if cfg.compile:
+            self.model.compile()
+            self.behaviour.imagine = torch.compile(self.behaviour.imagine)
 
     @torch.no_grad()
     def act(self, image, action, state, explore):
@@ -693,7 +705,7 @@ class Agent:
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
             metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
-        metrics["model_grad_norm"] = gradient_step(self.optimizers["model"], loss, metrics, clip)
+        metrics["model_grad_norm"] = gradient_step(self.optimizers["model"], loss, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
         start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}  # data here
@@ -705,7 +717,7 @@ class Agent:
             *losses, more = self.behaviour.losses(self.model, start, start.pop("discount"))
         metrics |= more
         for name, loss in zip(("actor", "critic"), losses, strict=True):
-            metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, metrics, clip)
+            metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, clip)
         return {key: value.detach() for key, value in metrics.items()}
 
     def state_dict(self):
@@ -1371,6 +1383,8 @@ class VideoTrainer(Trainer):
     def __init__(self, cfg, videos, device):
         self.cfg, self.videos, self.device = cfg, videos, device
         self.model = VideoPredictor(cfg).to(device)
+        if cfg.compile:
+            self.model.compile()
         self.optimizer = Adam(self.model, cfg.model_lr)
         self.progress, self.metrics, self.total = 0, [], cfg.pretrain_updates
 
@@ -1379,14 +1393,14 @@ class VideoTrainer(Trainer):
         batch = to_device(batch, self.device)
         with autocast(self.cfg):
             loss, metrics = self.model.loss(self.model(batch), batch)
-        norm = gradient_step(self.optimizer, loss, metrics, self.cfg.grad_clip)
+        norm = gradient_step(self.optimizer, loss, self.cfg.grad_clip)
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
 
     def advance(self):
         """An update → after every `chunk` of them, and at the end, a row of the log."""
         cfg, rng = self.cfg, np.random.default_rng([self.cfg.seed, self.progress])  # not saved
         self.batch = self.videos.sample(cfg.batch_size, cfg.batch_length, rng)
-        self.metrics.append(self.update(self.batch))
+        self.metrics.append(check_finite(self.update(self.batch)))
         self.progress += 1
         if self.progress % self.chunk and self.progress < self.total:
             return None
@@ -1422,7 +1436,8 @@ class AgentTrainer(Trainer):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             self.batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
             probe = self.updates % 100 == 0
-            metrics.append(self.agent.update(self.batch, eta, self.updates, probe))
+            update = self.agent.update(self.batch, eta, self.updates, probe)
+            metrics.append(check_finite(update))
             self.updates += 1
         return metrics
 
@@ -1503,7 +1518,8 @@ def announce(run, frames):
 def load_model(path, device):
     """The model of a checkpoint → (its cfg on `device`, Agent or VideoPredictor, the checkpoint)"""
     state = read_checkpoint(path)
-    cfg, trainer = replace(state["config"], device=device.type, precision="fp32"), state["trainer"]
+    auto = dict(device=device.type, precision="fp32", compile=False)
+    cfg, trainer = replace(state["config"], **auto), state["trainer"]
     with reading(path):
         if state["stage"] == "pretrain":
             model, weights = VideoPredictor(cfg).to(device), trainer["model"]

@@ -2448,7 +2448,7 @@ def test_bf16_steps_like_fp32():
         agent = diswm.Agent(cfg, 6, CPU, teacher)
         gradients = {}
 
-        def keep(optimizer, loss, metrics, clip):
+        def keep(optimizer, loss, clip):
             parameters = optimizer.param_groups[0]["params"]
             for p, g in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
                 gradients[p] = g.flatten().double()
@@ -3409,7 +3409,7 @@ def test_nan_gradient_of_a_finite_loss_stops_the_run(teacher, uncut, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diswm, "distillation_loss", steep)
-        refuse(*argv, says=("non-finite gradient", "nonfinite.npz"))
+        refuse(*argv, says=("non-finite model_grad_norm", "nonfinite.npz"))
     check_stopped_run(tmp_path / FINETUNED)
     succeed(*argv)
     assert_identical(everything(tmp_path / FINETUNED), uncut)
