@@ -123,7 +123,8 @@ class Config:
     eval_episodes: int = flag(10, "episodes per evaluation (published)", low=1)
     replay_capacity: int = flag(1_000_000, "rows kept in the replay (published)", low=1)
     # World model, Eqs. (1), (2), (4), (5).
-    encoder: str = flag("beta_vae", "image nets; conv: DreamerV2's (paper)", ("beta_vae", "conv"))
+    encoder: str = flag("beta_vae", "image encoder and decoder; conv: DreamerV2's (paper)",
+                        ("beta_vae", "conv"))
     carry_over: str = flag("none", "where a video predictor's weights go: nowhere, into an agent's "
                            "model, below its RSSM (paper)", ("none", "weights", "stack"))
     bonus: float = flag(0.0, "weight of the intrinsic bonus in the reward's target (APV: 0.1)")
@@ -145,7 +146,8 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "latents in Eq. (3) (paper; ours)", ("softmax", "gaussian"))
+    distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
+                        ("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
