@@ -10,6 +10,7 @@ import contextlib
 import copy
 import dataclasses
 import functools
+import inspect
 import io
 import itertools
 import json
@@ -233,6 +234,33 @@ def test_log_prob_and_entropy_equal_torch_distributions():
     log_prob = diswm.normal_log_prob(x, d["mean"], d["std"])
     torch.testing.assert_close(log_prob, normal.log_prob(x).sum(-1))
     torch.testing.assert_close(diswm.normal_entropy(d["std"]), normal.entropy().sum(-1))
+
+
+def test_sums_run_over_the_last_dimension_of_a_window():
+    """(B, T, ·) → (B, T). In two dimensions a sum over dim +1 instead of −1 looks the same."""
+    x, mean, std = randn(0, 2, 3, 4), randn(1, 2, 3, 4), randn(2, 2, 3, 4).exp()
+    normal = Normal(mean, std)
+    for value, oracle in (
+            (diswm.beta_vae_kl(mean, 2 * std.log()), kl_divergence(normal, Normal(0.0, 1.0))),
+            (diswm.normal_log_prob(x, mean, std), normal.log_prob(x)),
+            (diswm.normal_entropy(std), normal.entropy())):
+        torch.testing.assert_close(value, torch.stack(
+            [torch.stack([row.sum() for row in window]) for window in oracle]))
+
+
+@pytest.mark.parametrize("function, defaults", [
+    ("rssm_kl_loss", dict(balance=0.8, free_nats=1.0)), ("lambda_return", dict(lambda_=0.95)),
+    ("eta_schedule", dict(start=0.1, end=0.01, decay_steps=50_000, delay=0))])
+def test_the_maths_has_the_papers_values_by_default(function, defaults):
+    """Who calls a function as a library gets the hyperparameter table."""
+    parameters = inspect.signature(getattr(diswm, function)).parameters.values()
+    assert {p.name: p.default for p in parameters if p.default is not p.empty} == defaults
+
+
+def test_actions_are_clipped_one_millionth_inside_the_bounds():
+    """Section 2, row 8: ±(1 − 1e-6)."""
+    clipped = diswm.clip_action(torch.tensor([-9.0, -0.5, 9.0], dtype=torch.float64))
+    torch.testing.assert_close(clipped.tolist(), [1e-6 - 1, -0.5, 1 - 1e-6], atol=1e-12, rtol=0)
 
 
 def test_samples_have_their_moments_and_the_derivatives_of_a_reparameterised_draw():
@@ -2657,15 +2685,18 @@ def kill_at(argv, run, moment, skip):
     """SIGKILL a real process in the (skip + 1)-th write of a "checkpoint" or "episode", or so many
     seconds after its run folder is locked. Returns what was written at its death: a file that the
     process left half done or had not yet put in its place, "between", or "finished"."""
-    process, begin = start(argv), None
-    names = dict(checkpoint=run, episode=run / "episodes")
-    seen, inside = -1, False
+    def unfinished():
+        """Files being written, and when they last were; what earlier kills left keeps its time."""
+        for path in run.rglob("*.tmp"):
+            with contextlib.suppress(FileNotFoundError):
+                yield path, path.stat().st_mtime_ns
+
+    names, before = dict(checkpoint="checkpoint.pt.tmp", episode=".npz.tmp"), set(unfinished())
+    process, begin, seen, inside = start(argv), None, -1, False
     while process.poll() is None:
         if moment in names:
-            with contextlib.suppress(FileNotFoundError):
-                found = any(name.endswith(".tmp") and name != "config.json.tmp"
-                            for name in os.listdir(names[moment]))
-                seen, inside = seen + (found and not inside), found
+            found = any(path.name.endswith(names[moment]) for path, _ in set(unfinished()) - before)
+            seen, inside = seen + (found and not inside), found
             if seen == skip:
                 break
         elif (run / "lock").exists():
@@ -2676,7 +2707,7 @@ def kill_at(argv, run, moment, skip):
     process.kill()
     _, err = process.communicate()
     assert process.returncode in (0, -signal.SIGKILL), err
-    left = [f"{path.name} {path.stat().st_size} bytes" for path in run.rglob("*.tmp")]
+    left = [f"{path.name} {path.stat().st_size} bytes" for path, _ in set(unfinished()) - before]
     return " ".join(left) or ("between" if process.returncode else "finished")
 
 
