@@ -1505,14 +1505,19 @@ def evaluate_agent(cfg, agent, envs, phase, replay=None):
 
 # === Stages =======================================================================================
 
-def announce(run, frames):
-    """Say what runs, on what, its needs and folder."""
-    cfg, disk = run.cfg, 0.1 + frames * 12.35e-6                              # GB; a row is 12.3 kB
-    memory = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5  # measured
+def memory_needed(cfg):
+    """GB, as measured. Raises UserError where this machine has less."""
+    memory = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5
     have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     if cfg.device == "cpu" and memory > have:
         raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
                         "take a smaller --batch-size, --batch-length or --cnn-depth")
+    return memory
+
+def announce(run, frames):
+    """Say what runs, on what, its needs and folder."""
+    cfg, disk = run.cfg, 0.1 + frames * 12.35e-6                              # GB; a row is 12.3 kB
+    memory = memory_needed(cfg)
     print(f"{run.stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
           f"{cfg.precision} and {torch.get_num_threads()} threads\n  needs about {disk:.1f} GB of "
           f"disk and {memory:.1f} GB of memory; results go to {run.folder}", flush=True)
@@ -1901,6 +1906,7 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
     """Time the steps, count the parameters.
     An update, a pretraining update, drawing a batch; in each family of tasks a frame, a decision.
     scaling: also the update at four batch sizes and horizons, and the exponent of its growth."""
+    memory_needed(cfg)                                                        # or an error
     device, rng, result = torch.device(cfg.device), np.random.default_rng(0), machine(cfg)
     result |= {name: getattr(cfg, name) for name in ("method", "batch_size", "batch_length")}
     teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
