@@ -1736,7 +1736,8 @@ def test_parallel_episodes_end_one_by_one_and_updates_count_decisions(seed, ever
         trainer = AgentTrainer(cfg, Path(folder), CPU)
         trainer.replay.add(numbered_rows(0, 20))
         trainer.updates = 1
-        trainer.agent.update = lambda *args: updates.append(trainer.decisions) or {}
+        trainer.agent.update = lambda *args: updates.append(trainer.decisions) or dict(
+            loss=torch.zeros(()))
         episodes, _ = trainer.play()
     lengths = [4 + s % 4 for s in seeds]
     assert [len(rows) - 1 for rows, *_ in episodes] == lengths
