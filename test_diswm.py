@@ -2011,7 +2011,8 @@ def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
         trainer.agent.act = lambda *args, **kwargs: (
             acted.append(trainer.decisions) or act(*args, **kwargs))
         trainer.agent.update = lambda batch, eta, update, probe=False: calls.append(
-            (trainer.decisions, update, eta)) or {}
+            (trainer.decisions, update, eta)) or dict(
+                loss=torch.zeros(()))
         play_on_counting(trainer)
     # Nothing can be learnt before the first episode, of ten decisions, is in the replay.
     start = max(prefill, 11)
