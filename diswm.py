@@ -1931,8 +1931,7 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
             growth = dict(exponent=float(np.polyfit(np.log(sizes), np.log(times), 1)[0]))
             result[f"{name}_scaling"] = dict(zip(map(str, sizes), times, strict=True)) | growth
     agent = Agent(cfg, actions, device, teacher)
-    parts = dict(world_model=agent.model, teacher=agent.teacher)
-    parts |= agent.behaviour.named_children()                                 # actor and critics
+    parts = dict(agent.behaviour.named_children(), world_model=agent.model, teacher=teacher)
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
     result |= dict(params=counts | dict(total=sum(counts.values())), frame_ms={}, decision_ms={})
     for task in family_tasks(cfg):
