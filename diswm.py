@@ -335,8 +335,8 @@ class PerFrame(nn.Module):
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
 
-    def __init__(self, z_dim, d):
-        shapes = [(4, 2, 1)] * 4 + [(4,)]                                     # 32, 16, 8, 4, 1
+    def __init__(self, z_dim=20, depth=32):
+        d, shapes = depth, [(4, 2, 1)] * 4 + [(4,)]                           # 32, 16, 8, 4, 1
         super().__init__(3, *stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes),
                          nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
         self.apply(kaiming)
@@ -348,13 +348,16 @@ class BetaVAEEncoder(PerFrame):
         mean, logvar = self(image)
         return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
 
-def beta_vae_decoder(feat_dim, z_dim, d):
+class BetaVAEDecoder(PerFrame):
     """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
-    shapes = [(4,)] + [(4, 2, 1)] * 3                                         # 4, 8, 16, 32, 64
-    return PerFrame(1, nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
-                    nn.Unflatten(-1, (8 * d, 1, 1)),
-                    *stack(nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], shapes),
-                    nn.ConvTranspose2d(d, 3, 4, 2, 1)).apply(kaiming)
+
+    def __init__(self, feat_dim, z_dim=20, depth=32):
+        d, shapes = depth, [(4,)] + [(4, 2, 1)] * 3                           # 4, 8, 16, 32, 64
+        super().__init__(1, nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
+                         nn.Unflatten(-1, (8 * d, 1, 1)),
+                         *stack(nn.ConvTranspose2d, [8 * d, 2 * d, 2 * d, d, d], shapes),
+                         nn.ConvTranspose2d(d, 3, 4, 2, 1))
+        self.apply(kaiming)
 
 def conv_encoder(d):
     """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32 d)."""
@@ -485,7 +488,7 @@ class VideoPredictor(nn.Module):
         self.cfg, vae = cfg, cfg.encoder == "beta_vae"
         feat, d = cfg.stoch + cfg.deter, cfg.cnn_depth
         self.encoder = BetaVAEEncoder(cfg.z_dim, d) if vae else conv_encoder(d)
-        self.decoder = beta_vae_decoder(feat, cfg.z_dim, d) if vae else conv_decoder(feat, d)
+        self.decoder = BetaVAEDecoder(feat, cfg.z_dim, d) if vae else conv_decoder(feat, d)
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
         self.rssm = rssm(action_dim, cfg.z_dim if vae else 32 * d, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
@@ -657,8 +660,8 @@ def gradient_step(optimizer, loss, clip):
     return norm
 
 def check_finite(metrics):
-    """Raises FloatingPointError, which names the first that are not, unless all of an update's
-    metrics are finite. Waits for a GPU, once an update."""
+    """An update's metrics, as they are. Raises FloatingPointError unless all are finite, with the
+    names of the first that are not. Here, once an update, one waits for a GPU."""
     finite = torch.stack(list(metrics.values())).isfinite().tolist()
     bad = [name for name, good in zip(metrics, finite, strict=True) if not good]
     if bad:
@@ -784,9 +787,10 @@ def npz_layout(path, keys, plain=True):
                 np.lib.format.read_magic(member)
                 shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
                 header = member.tell()
-            file.seek(info.header_offset + 26)       # the local header, 30 bytes, ends in
+            # The local header, 30 bytes, ends in the lengths of two fields that follow it.
+            file.seek(info.header_offset + 26)
             start = info.header_offset + 30 + int(np.frombuffer(file.read(4), "<u2").sum())
-            mapped = info.compress_type == zipfile.ZIP_STORED and not fortran  # two lengths
+            mapped = info.compress_type == zipfile.ZIP_STORED and not fortran
             end = start + (info.file_size if mapped else info.compress_size)
             size = header + math.prod(shape) * dtype.itemsize
             if info.file_size != size or end > os.path.getsize(path):
@@ -1363,7 +1367,6 @@ def mean_metrics(rows):
 class Trainer:
     """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics or
     None. What changes: `parts` that have a state_dict, and `counters`; `batch`: the latest."""
-    counters = ("progress",)
 
     def state_dict(self):
         parts = {name: getattr(self, name).state_dict() for name in self.parts}
@@ -1473,8 +1476,7 @@ class AgentTrainer(Trainer):
         row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
         row |= {} if None in success else dict(train_success=statistics.fmean(success))
         if self.progress >= self.total or self.progress // cfg.eval_every > start // cfg.eval_every:
-            apart = family(cfg.dst) == "drawer"  # its third table top is never trained on
-            result = evaluate_agent(cfg, self.agent, self.envs, "eval" if apart else self.phase)
+            result = evaluate_agent(cfg, self.agent, self.envs, judged_phase(cfg, self.phase))
             row["eval_return"] = result.pop("mean")
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
@@ -1484,6 +1486,10 @@ class AgentTrainer(Trainer):
         net = self.agent.teacher
         saved = dict(depth=net.net[0].out_channels, weights=net.state_dict()) if net else None
         return super().state_dict() | dict(teacher=saved, action_dim=self.agent.action_dim)
+
+def judged_phase(cfg, phase):
+    """What is evaluated in a phase of training: a drawer's third table top is never trained on."""
+    return "eval" if family(cfg.dst) == "drawer" else phase
 
 def evaluate_agent(cfg, agent, envs, phase, replay=None):
     """Play `eval_episodes` episodes into the replay, the same seeds every time; agent None: random.
@@ -1617,7 +1623,7 @@ def evaluate(cfg, folder):
     if not isinstance(agent, Agent):
         raise UserError(f"{folder} is a video predictor without a policy; give a finetune run")
     switched = step >= int(cfg.switch * cfg.steps) < cfg.steps                # as while it trained
-    phase = "eval" if family(cfg.dst) == "drawer" else "shifted" if switched else "train"
+    phase = judged_phase(cfg, "shifted" if switched else "train")
     result = dict(task=cfg.dst, phase=phase, step=step)
     shutil.rmtree(folder / "evaluation", ignore_errors=True)
     replay, said = Replay(folder / "evaluation"), []

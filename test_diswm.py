@@ -833,6 +833,15 @@ def test_the_terms_are_the_negative_log_likelihoods_of_equations_4_and_5():
         torch.testing.assert_close(terms[name], oracle, rtol=1e-4, atol=1e-5)
 
 
+def test_the_autoencoder_has_the_papers_sizes_by_default():
+    """The names and defaults that other code relies on: 20 latents, 64 × 64 pixels."""
+    image = torch.zeros(2, 3, 3, 64, 64)
+    mean, logvar = diswm.BetaVAEEncoder()(image)
+    assert mean.shape == logvar.shape == (2, 3, 20)
+    assert diswm.BetaVAEDecoder(250)(torch.zeros(2, 3, 250)).shape == image.shape
+    assert sum(p.numel() for p in diswm.BetaVAEEncoder(z_dim=20, depth=32).parameters()) == 389_096
+
+
 # === RSSM =========================================================================================
 
 def window(seed, batch=3, length=6, action_dim=2, kind="RSSM"):
@@ -2541,19 +2550,27 @@ def test_every_readme_command_runs(empty, few_frames):
 
 # === System: cut and resume =======================================================================
 
-def cut(patch, owner, name, call):
-    """Ctrl-C at the `call`-th call of owner.name, counted from 1."""
+def patch_before_call(patch, owner, name, call, action):
+    """From now on, `action` happens just before the `call`-th call of owner.name, counted from 1.
+    Returns the count of calls, in a list."""
     original, count = getattr(owner, name), [0]
 
     @functools.wraps(original)
     def wrapper(*args, **kwargs):
         count[0] += 1
         if count[0] == call:
-            raise KeyboardInterrupt
+            action()
         return original(*args, **kwargs)
 
     patch.setattr(owner, name, wrapper)
     return count
+
+
+def cut(patch, owner, name, call):
+    """Ctrl-C at the `call`-th call of owner.name. Returns the count of calls, in a list."""
+    def interrupt():
+        raise KeyboardInterrupt
+    return patch_before_call(patch, owner, name, call, interrupt)
 
 
 COLLECTED = "collect/cheetah_run/dreamerv2/seed0"
@@ -2887,18 +2904,9 @@ def fill(folder):
 
 @contextlib.contextmanager
 def before_call(owner, name, call, action):
-    """Do something just before the `call`-th call of owner.name."""
-    original, count = getattr(owner, name), [0]
-
-    @functools.wraps(original)
-    def wrapper(*args, **kwargs):
-        count[0] += 1
-        if count[0] == call:
-            action()
-        return original(*args, **kwargs)
-
+    """`action` happens within the block, just before the `call`-th call of owner.name."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(owner, name, wrapper)
+        count = patch_before_call(patch, owner, name, call, action)
         yield
     assert count[0] >= call
 
