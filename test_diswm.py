@@ -2927,10 +2927,10 @@ def test_full_disk_in_an_episode_loses_nothing(teacher, uncut, small_disk):
     ids=["config.json", "TensorBoard", "checkpoint"])
 def test_full_disk_in_pretraining_loses_nothing(
         owner, name, call, root, brief, small_disk, monkeypatch):
-    """Wherever it strikes; TensorBoard, which else writes every two minutes, does so at once."""
+    """Wherever it strikes; TensorBoard, which else writes every two minutes, does so soon."""
     argv, run = pretrain_command(root, small_disk), small_disk / PRETRAINED
     monkeypatch.setattr(tensorboard, "SummaryWriter", functools.partial(
-        tensorboard.SummaryWriter, max_queue=1, flush_secs=0))
+        tensorboard.SummaryWriter, max_queue=1, flush_secs=0.1))
     with before_call(owner, name, call, lambda: fill(small_disk)):
         refuse(*argv, says="No space left")
     assert diswm.read_checkpoint(run / "checkpoint.pt") and not list(run.rglob("*.tmp"))
