@@ -101,7 +101,7 @@ class Config:
     seed: int = flag(0, "seed of everything random (ours)")
     runs: str = flag("runs", "folder of all runs (ours)", free=True)
     teacher: str = flag("", "teacher's checkpoint.pt; empty: the one for --src (ours)", free=True)
-    videos: str = flag("", "folder of .npz videos; empty: what collect made (ours)", free=True)
+    videos: str = flag("", "folder of .npy, .npz videos; empty: collect's (ours)", free=True)
     # Environment (section 4).
     action_repeat: int = flag(2, "env steps per decision (published)", low=1)
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
@@ -317,6 +317,10 @@ def preprocess(image):
     """uint8 (..., 64, 64, 3) → float (..., 3, 64, 64) in [−0.5, 0.5]"""
     return image.movedim(-1, -3).float() / 255 - 0.5
 
+def latent_code(mean, logvar):
+    """A draw of 𝐳 with its posterior: dict of `embed`, `mean`, `logvar`, (..., Z) each."""
+    return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
+
 class PerFrame(nn.Module):
     """Layers for the last `dims` dimensions; all before them are one batch. fp32 out.
     In the encoders and decoders, d is the number of channels of the image's convolution."""
@@ -329,7 +333,7 @@ class PerFrame(nn.Module):
         return self.net(x.flatten(0, -1 - self.dims)).float().unflatten(0, x.shape[:-self.dims])
 
     def encode(self, image):
-        """→ dict of `embed`; a β-VAE's is a sample of 𝐳, with the `mean` and `logvar` behind it"""
+        """→ dict of `embed`; a β-VAE's is a latent_code"""
         return dict(embed=self(image))
 
 class BetaVAEEncoder(PerFrame):
@@ -345,8 +349,7 @@ class BetaVAEEncoder(PerFrame):
         return super().forward(image).chunk(2, -1)
 
     def encode(self, image):
-        mean, logvar = self(image)
-        return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
+        return latent_code(*self(image))
 
 class BetaVAEDecoder(PerFrame):
     """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
@@ -508,7 +511,7 @@ class VideoPredictor(nn.Module):
 
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
-        teacher: dict of embed, mean, logvar of the same images from the frozen teacher, or None."""
+        teacher: latent_code of the same images from the frozen teacher, or None."""
         cfg, code, terms = self.cfg, out["code"], self.terms(out, batch)
         loss, kl = rssm_kl_loss(out["post"], out["prior"], cfg.kl_balance, cfg.free_nats)
         metrics = dict(kl_loss=loss, kl=kl.mean(), eta=loss.new_full((), eta),
@@ -694,6 +697,15 @@ class Agent:
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
 
+    @torch.no_grad()
+    def taught(self, rows):
+        """What the frozen teacher makes of an episode's images: {TEACHER: (T, Z)}, or {}."""
+        if self.teacher is None:
+            return {}
+        image = torch.from_numpy(np.stack([row["image"] for row in rows])).to(self.device)
+        code = self.teacher(preprocess(image))
+        return {key: x.cpu().numpy() for key, x in zip(TEACHER, code, strict=True)}
+
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
         update: index of this step. probe: measure distillation's own gradient at the encoder."""
@@ -704,7 +716,8 @@ class Agent:
             bonus = self.model.bonus(out["post"].get("below", out["feat"]))
             batch["reward"] = batch["reward"][:, :bonus.shape[1]] + cfg.bonus * bonus
         with autocast(cfg):
-            teacher = self.teacher.encode(batch["image"]) if self.teacher else None
+            # Kept beside the replay, which is right only as the teacher is frozen: 8 % of a step.
+            teacher = latent_code(*(batch[key] for key in TEACHER)) if self.teacher else None
             loss, metrics = self.model.loss(out, batch, teacher, eta)
         if probe and "distill" in metrics:
             grads = torch.autograd.grad(eta * metrics["distill"],
@@ -738,13 +751,20 @@ class Agent:
 # === Replay and video sets: episodes on disk ======================================================
 
 # A row holds an image and what led to it (see RSSM for how rows line up).
-ROW = dict(image=np.uint8, action=np.float32, reward=np.float32, discount=np.float32,
-           is_first=np.bool_, is_terminal=np.bool_)
-VIDEO_KEYS = ("image", "is_first")  # all that a video predictor may see
+VIDEO = np.dtype([("image", np.uint8, (64, 64, 3)), ("is_first", np.bool_)])
+TEACHER = ("teacher_mean", "teacher_logvar")
+
+def row_type(action_dim, z_dim=0):
+    """A row of an agent's episode as a NumPy dtype; z_dim: with the TEACHER's code of its image.
+    A video predictor may see what is in VIDEO and nothing else."""
+    return np.dtype([*VIDEO.descr, ("action", np.float32, (action_dim,)), ("reward", np.float32),
+                     ("discount", np.float32), ("is_terminal", np.bool_),
+                     *((key, np.float32, (z_dim,)) for key in TEACHER if z_dim)])
 
 def make_row(image, action, reward=0.0, terminal=False, first=False):
     """One row of an episode."""
-    return dict(zip(ROW, (image, action, reward, 1.0 - terminal, first, terminal), strict=True))
+    return dict(image=image, action=action, reward=reward, discount=1.0 - terminal, is_first=first,
+                is_terminal=terminal)
 
 @contextlib.contextmanager
 def atomic(path):
@@ -773,76 +793,62 @@ def reading(path, kind="checkpoint of ours", remedy="restore it, or start over w
         cause = f"{type(error).__name__}: {error}"[:120]
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from None
 
-def npz_layout(path, keys, plain=True):
-    """Where the arrays of an .npz lie in the file: {key: dict(offset, dtype, shape)}, bytes.
-    The offset of an array that is compressed, or in Fortran's order, is None. Raises UserError
-    unless `keys` are arrays as make_row has them, a row for each image uint8 (64, 64, 3); `plain`:
-    and have an offset. Nothing is unpacked: a zip bomb is refused by the size that it declares."""
-    layout, damage = {}, reading(path, f"episode with {', '.join(keys)}", "remove it")
-    with damage, zipfile.ZipFile(path) as archive, open(path, "rb") as file:
-        for info in archive.infolist():
-            if info.file_size > max(2**30, 100 * info.compress_size):
-                raise ValueError(f"{info.filename} would unpack to {info.file_size:,} bytes")
-            with archive.open(info) as member:
-                np.lib.format.read_magic(member)
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(member)
-                header = member.tell()
-            # The local header, 30 bytes, ends in the lengths of two fields that follow it.
-            file.seek(info.header_offset + 26)
-            start = info.header_offset + 30 + int(np.frombuffer(file.read(4), "<u2").sum())
-            mapped = info.compress_type == zipfile.ZIP_STORED and not fortran
-            end = start + (info.file_size if mapped else info.compress_size)
-            size = header + math.prod(shape) * dtype.itemsize
-            if info.file_size != size or end > os.path.getsize(path):
-                raise ValueError(f"{info.filename} is cut off, or no plain array")
-            name = info.filename.removesuffix(".npy")
-            layout[name] = dict(offset=start + header if mapped else None, dtype=dtype, shape=shape)
-        length = len(range(layout["image"]["shape"][0]))
-        for key in keys:
-            offset, dtype, shape = layout[key].values()
-            row = dict(image=(64, 64, 3), action=shape[1:2]).get(key, ())
-            if dtype != ROW[key] or shape != (length, *row) or not length:
-                raise ValueError(f"{key} is {dtype} {shape}, not {np.dtype(ROW[key])} (T, *{row})")
-            if plain and offset is None:
-                raise ValueError(f"{key} is compressed, which only --videos may be")
-    return layout
+def check_archive(path, limit):
+    """Raise ValueError at a zip that was altered, or a bomb: it declares more bytes than limit."""
+    with zipfile.ZipFile(path) as archive:
+        size = sum(info.file_size for info in archive.infolist())
+        if size > limit or archive.testzip():
+            raise ValueError(f"altered, or a bomb: it would unpack to {size:,} bytes")
 
 class Replay:
     """Finished episodes, a file each, laid end to end; windows start uniformly anywhere.
-
-    Only an index is in memory. Files, for `np.load`, are not compressed: `sample` maps their rows.
         episodes    ┌──────── 0 ────────┐┌──── 1 ────┐┌─────── 2 ──────
         rows        F . . . . . . . . . .F . . . . . .F . . . . . . . .      F: is_first
         a window                [. . . . . . F . . .]
-    """
+    Only an index is in memory. A file is an array of rows that `np.load` opens: an episode's images
+    are np.load(path)["image"]. Fields that are not in `dtype` are left unread."""
 
-    def __init__(self, folder, capacity=None, keys=tuple(ROW)):
-        self.folder, self.capacity, self.keys = Path(folder), capacity, keys
+    def __init__(self, folder, dtype=VIDEO, capacity=None):
+        self.folder, self.dtype, self.capacity = Path(folder), dtype, capacity
         # All files: a checkpoint may need those that the ones after it pushed out.
-        self._hold([(path, npz_layout(path, keys)) for path in sorted(self.folder.glob("*.npz"))])
+        self._hold([(path, len(self.read(path))) for path in sorted(self.folder.glob("*.npy"))])
         last = self.paths[-1].stem if self.paths else ""
         self.next_index = int(last) + 1 if last.isdecimal() else 0
 
     def _hold(self, episodes):
-        """Index (path, layout) pairs."""
+        """Index (path, length) pairs."""
         self.episodes, self.paths = episodes, [path for path, _ in episodes]
-        self.ends = np.cumsum([layout["image"]["shape"][0] for _, layout in episodes]).tolist()
+        self.ends = np.cumsum([length for _, length in episodes], dtype=int).tolist()
         self.rows = self.ends[-1] if episodes else 0
 
-    def add(self, rows):
-        """Append a finished episode, a list of `make_row`; the oldest beyond capacity go."""
+    def read(self, path):
+        """An episode's rows, mapped, not read. UserError unless it has the fields of `dtype`."""
+        with reading(path, f"episode with {', '.join(self.dtype.names)}", "remove it"):
+            rows = np.load(path, mmap_mode="r", allow_pickle=False)
+            if rows.ndim != 1 or not len(rows):
+                raise ValueError(f"its shape is {rows.shape}")
+            for name in self.dtype.names:
+                if rows.dtype[name] != self.dtype[name]:
+                    raise ValueError(f"{name} is {rows.dtype[name]}, not {self.dtype[name]}")
+        return rows
+
+    def add(self, rows, **more):
+        """Append a finished episode, a list of `make_row`; the oldest beyond capacity go.
+        more: fields that these do not have, arrays (T, ...)."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"{self.next_index:06d}.npz"
+        path, episode = self.folder / f"{self.next_index:06d}.npy", np.empty(len(rows), self.dtype)
+        for name in self.dtype.names:
+            episode[name] = more[name] if name in more else [row[name] for row in rows]
         with atomic(path) as file:
-            np.savez(file, **{key: np.array([r[key] for r in rows], ROW[key]) for key in ROW})
-        self._hold([*self.episodes, (path, npz_layout(path, self.keys))])
+            np.save(file, episode)
+        self._hold([*self.episodes, (path, len(rows))])
         while self.capacity and self.rows - self.ends[0] >= self.capacity:
             self._hold(self.episodes[1:])
         self.next_index += 1
 
     def prune(self):
         """Delete files not in the index, once no checkpoint needs them."""
-        for path in set(self.folder.glob("*.npz")) - set(self.paths):
+        for path in set(self.folder.glob("*.npy")) - set(self.paths):
             path.unlink()
 
     def state_dict(self):
@@ -852,7 +858,7 @@ class Replay:
     def load_state_dict(self, state):
         """Return to those episodes; later ones, of a run cut off, go."""
         numbers, self.next_index = range(state["first"], state["next"]), state["next"]
-        self._hold([(path, layout) for path, layout in self.episodes
+        self._hold([(path, length) for path, length in self.episodes
                     if path.stem.isdecimal() and int(path.stem) in numbers])
         if len(self.paths) != len(numbers):
             raise UserError(f"{self.folder} lacks episodes of its checkpoint; start over: --fresh")
@@ -863,39 +869,44 @@ class Replay:
         pieces = []
         while length > 0:
             index = np.searchsorted(self.ends, start, "right")
-            count = min(length, self.ends[index] - start)
-            path, layout = self.episodes[index]
-            row = start - self.ends[index] + layout["image"]["shape"][0]      # within the episode
-            pieces.append({key: np.memmap(path, mode="r", **layout[key])[row:row + count]
-                           for key in self.keys})
-            start, length = start + count, length - count
-        return {key: np.concatenate([piece[key] for piece in pieces]) for key in self.keys}
+            rows = self.read(self.paths[index])[start - self.ends[index]:][:length]
+            pieces.append(rows)
+            start, length = start + len(rows), length - len(rows)
+        return {key: np.concatenate([rows[key] for rows in pieces]) for key in self.dtype.names}
 
     def sample(self, batch_size, length, rng):
         """Dict of (B, T, ...); windows begin is_first."""
         starts = rng.integers(0, self.rows - length + 1, batch_size)
         windows = [self.window(int(start), length) for start in starts]
-        batch = {key: np.stack([window[key] for window in windows]) for key in self.keys}
+        batch = {key: np.stack([window[key] for window in windows]) for key in self.dtype.names}
         batch["is_first"][:, 0] = True
         return batch
 
 def open_videos(folder, cache):
-    """The .npz episodes of a folder as a Replay of images.
-    Foreign ones (the authors' are compressed and lack is_first) are unpacked into `cache`, once."""
-    paths = sorted(Path(folder).glob("*.npz"))
-    layouts = [npz_layout(path, ("image",), plain=False) for path in paths]
-    if not layouts:
-        raise UserError(f"no episodes (*.npz) in {folder}; run: python diswm.py collect --src TASK")
-    if all("is_first" in layout and layout["image"]["offset"] for layout in layouts):
-        return Replay(folder, keys=VIDEO_KEYS)
+    """The episodes of a folder, *.npy of ours or anybody's *.npz, as a Replay of images.
+    An .npz, the authors' are compressed, is unpacked into `cache`, once; not a zip bomb."""
+    paths = sorted(Path(folder).glob("*.np[yz]"))
+    if not paths:
+        raise UserError(f"no episodes (*.npy, *.npz) in {folder}; run: python diswm.py collect "
+                        "--src TASK")
+    if all(path.suffix == ".npy" for path in paths):
+        return Replay(folder)
     cache.mkdir(parents=True, exist_ok=True)
     for path in paths:
-        if not (cache / path.name).exists():
-            with reading(path, "video", "remove it"), np.load(path, allow_pickle=False) as episode:
-                image = np.ascontiguousarray(episode["image"])
-            with atomic(cache / path.name) as file:
-                np.savez(file, image=image, is_first=np.arange(len(image)) == 0)
-    return Replay(cache, keys=VIDEO_KEYS)
+        unpacked = cache / f"{path.name}.npy"
+        if not unpacked.exists():
+            with reading(path, "video", "remove it"):
+                if path.suffix == ".npz":
+                    check_archive(path, max(2**30, 100 * os.path.getsize(path)))
+                image = np.load(path, mmap_mode="r", allow_pickle=False)["image"]
+                if image.dtype != np.uint8 or image.shape != (len(image) or 1, 64, 64, 3):
+                    raise ValueError(f"image is {image.dtype} {image.shape}, "
+                                     "not uint8 (T, 64, 64, 3)")
+            with atomic(unpacked) as file:
+                rows = np.zeros(len(image), VIDEO)
+                rows["image"], rows["is_first"][0] = image, True
+                np.save(file, rows)
+    return Replay(cache)
 
 # === Environments =================================================================================
 
@@ -1237,11 +1248,8 @@ def read_checkpoint(path):
     if not Path(path).exists():
         raise UserError(f"there is no checkpoint {path}; train that run first, for instance: "
                         "python diswm.py finetune --dst walker_walk")
-    with reading(path), zipfile.ZipFile(path) as archive:
-        # torch.load would unpack a bomb, and looks at no checksum.
-        packed = sum(info.file_size for info in archive.infolist()) > os.path.getsize(path)
-        if packed or archive.testzip():
-            raise ValueError("compressed, or altered")
+    with reading(path):
+        check_archive(path, os.path.getsize(path))  # torch.load looks at no checksum
         state = torch.load(path, map_location="cpu", weights_only=True)
         state["config"] = Config(**state["config"])
         tensors = [x for x in tree_leaves(state["trainer"]) if isinstance(x, torch.Tensor)]
@@ -1423,7 +1431,8 @@ class AgentTrainer(Trainer):
         self.cfg = cfg
         self.envs = config_envs(cfg, cfg.dst)
         self.agent = Agent(cfg, self.envs.single_action_space.shape[0], device, teacher)
-        self.replay = Replay(folder / "episodes", cfg.replay_capacity)
+        rows = row_type(self.agent.action_dim, cfg.z_dim if teacher else 0)
+        self.replay = Replay(folder / "episodes", rows, cfg.replay_capacity)
         self.progress = self.decisions = self.updates = self.episodes = 0
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
 
@@ -1470,7 +1479,7 @@ class AgentTrainer(Trainer):
         self.episodes += len(episodes)
         rows, returns, success = zip(*episodes, strict=True)
         for episode in rows:
-            self.replay.add(episode)
+            self.replay.add(episode, **self.agent.taught(episode))
         row = dict(step=self.progress, phase=self.phase, train_return=statistics.fmean(returns),
                    train_length=statistics.mean(len(episode) - 1 for episode in rows))
         row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
@@ -1626,7 +1635,7 @@ def evaluate(cfg, folder):
     phase = judged_phase(cfg, "shifted" if switched else "train")
     result = dict(task=cfg.dst, phase=phase, step=step)
     shutil.rmtree(folder / "evaluation", ignore_errors=True)
-    replay, said = Replay(folder / "evaluation"), []
+    replay, said = Replay(folder / "evaluation", row_type(agent.action_dim)), []
     for name, policy in (("", agent), ("random_", None)):                  # which need not see
         with contextlib.closing(config_envs(cfg, cfg.dst, pixels=bool(policy))) as envs:
             more = evaluate_agent(cfg, policy, envs, phase, replay if policy else None)
@@ -1638,7 +1647,7 @@ def evaluate(cfg, folder):
     (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
     print(f"{cfg.dst}, {phase} colours, after {step:,} env steps: return {said[0]}; "
           f"random policy: {said[1]}; {cfg.eval_episodes} episodes each\n"
-          f"wrote evaluation.json, evaluation.mp4 and evaluation/*.npz in {folder}")
+          f"wrote evaluation.json, evaluation.mp4 and evaluation/*.npy in {folder}")
 
 # === Figures ======================================================================================
 
@@ -1767,11 +1776,12 @@ def traverse(cfg, folder, metrics=False):
     videos, device = cfg.videos, torch.device(cfg.device)
     cfg, model, _ = load_model(folder / "checkpoint.pt", device)
     if isinstance(model, Agent):
-        replay, teacher, model = Replay(folder / "episodes"), model.teacher, model.model
+        replay = Replay(folder / "episodes", row_type(model.action_dim))
+        teacher, model = model.teacher, model.model
     else:
         source = folder.resolve().parent.parent.name
         places = [folder / "videos", *folder.glob(f"../../../../collect/{source}/*/seed*/episodes")]
-        replay = Replay(videos or next(filter(Path.exists, places), places[0]), keys=VIDEO_KEYS)
+        replay = Replay(videos or next(filter(Path.exists, places), places[0]))
         teacher, cfg = None, replace(cfg, dst=cfg.src)                        # also of old runs
     if metrics and cfg.encoder != "beta_vae":
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
@@ -1922,10 +1932,12 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
     with contextlib.closing(config_env(cfg, cfg.dst, "none", pixels=False)) as env:
         actions = env.action_space.shape[0]
     with tempfile.TemporaryDirectory() as folder:
-        replay = Replay(folder)
+        replay = Replay(folder, row_type(actions, cfg.z_dim if teacher else 0))
+        agent = Agent(cfg, actions, device, teacher)
         noise = rng.integers(0, 256, (max(1000, cfg.batch_length), 64, 64, 3), np.uint8)
-        replay.add([make_row(image, rng.uniform(-1, 1, actions)) for image in noise])
-        result["train_step_s"] = update_s(cfg, Agent(cfg, actions, device, teacher), cfg.eta, 1)
+        rows = [make_row(image, rng.uniform(-1, 1, actions)) for image in noise]
+        replay.add(rows, **agent.taught(rows))
+        result["train_step_s"] = update_s(cfg, agent, cfg.eta, 1)
         result["sample_ms"] = 1e3 * median_s(
             lambda: replay.sample(cfg.batch_size, cfg.batch_length, rng), 20)
         result["pretrain_step_s"] = update_s(cfg, VideoTrainer(cfg, None, device))
@@ -1936,7 +1948,6 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
             times = [update_s(c, Agent(c, actions, device, teacher), c.eta, 1) for c in cfgs]
             growth = dict(exponent=float(np.polyfit(np.log(sizes), np.log(times), 1)[0]))
             result[f"{name}_scaling"] = dict(zip(map(str, sizes), times, strict=True)) | growth
-    agent = Agent(cfg, actions, device, teacher)
     parts = dict(agent.behaviour.named_children(), world_model=agent.model, teacher=teacher)
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
     result |= dict(params=counts | dict(total=sum(counts.values())), frame_ms={}, decision_ms={})
