@@ -264,9 +264,10 @@ def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
         returns.append(target)
     return torch.stack(returns[::-1])                                         # back in time order
 
-def squared_error(target, prediction):
-    """−ln N(target; prediction, 1), less ½ ln 2π, elementwise."""
-    return 0.5 * F.mse_loss(prediction, target, reduction="none")
+def squared_error(target, prediction, dims=0):
+    """−ln N(target; prediction, 1), less ½ ln 2π each, summed over the last `dims` dimensions."""
+    error = F.mse_loss(prediction, target, reduction="none")
+    return 0.5 * (error.flatten(-dims).sum(-1) if dims else error)
 
 def gaussian_sample(mean, std):
     """A reparameterised draw: the gradient reaches mean and std."""
@@ -315,7 +316,7 @@ def kaiming(module):
 
 def preprocess(image):
     """uint8 (..., 64, 64, 3) → float (..., 3, 64, 64) in [−0.5, 0.5]"""
-    return image.movedim(-1, -3).float() / 255 - 0.5
+    return image.movedim(-1, -3).float().div_(255).sub_(0.5)
 
 def latent_code(mean, logvar):
     """A draw of 𝐳 with its posterior: dict of `embed`, `mean`, `logvar`, (..., Z) each."""
@@ -505,9 +506,9 @@ class VideoPredictor(nn.Module):
     def terms(self, out, batch):
         """Loss terms of each step, (B, T), nats, but for the KL."""
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
-        error, code = squared_error(batch["image"], self.decoder(out["feat"])), out["code"]
+        image, code = squared_error(batch["image"], self.decoder(out["feat"]), 3), out["code"]
         vae = dict(disentangle=beta_vae_kl(code["mean"], code["logvar"])) if "mean" in code else {}
-        return dict(image=error.sum((-3, -2, -1))) | vae
+        return dict(image=image) | vae
 
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
