@@ -78,7 +78,6 @@ except (AttributeError, ImportError) as error:  # how a missing libEGL or libOSM
 
 class UserError(Exception):
     """A mistake that the user can mend: printed as one line; `code` is the exit status."""
-
     def __init__(self, message, code=1):
         super().__init__(message)
         self.code = code
@@ -105,8 +104,8 @@ class Config:
     # Environment (section 4).
     action_repeat: int = flag(2, "env steps per decision (published)", low=1)
     time_limit: int = flag(0, "env steps per episode; 0: the task's own (ours)")
-    colors: str = flag("published", "colour boxes around fixed centres, or the original colours "
-                       "(published; paper)", ("published", "original"))
+    colors: str = flag("published", "boxes around fixed centres (published) or original colours "
+                       "(paper)", ("published", "original"))
     color_range: float = flag(0.2, "half width of a colour box, RGB in 0..1 (published)", high=1)
     color_step_std: float = flag(0.0, "std of the colours' random walk per decision (ours)")
     fast_render: bool = flag(False, "no anti-aliasing, about twice as fast (ours)")
@@ -146,13 +145,12 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
-                        ("softmax", "gaussian"))
+    distill: str = flag("softmax", "latents in Eq. (3) (paper; ours)", ("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
-    eta_delay: int = flag(-1, "decisions before it; -1: eta_decay across domains, else 0 "
-                          "(published)", low=-1)
+    eta_delay: int = flag(-1, "decisions before; -1: 0, or eta_decay across domains (published)",
+                          low=-1)
     # Behaviour, appendix B.
     horizon: int = flag(15, "imagined transitions, H (table)", low=1, high=1_000)
     imagine_starts: int = flag(0, "states of a batch to imagine from; 0: all (ours)")
@@ -170,7 +168,6 @@ class Config:
                           ("auto", "fp32", "bf16"), free=True)
     threads: int = flag(0, "CPU threads; 0: one per core (ours)", high=1024, free=True)
     compile: bool = flag(False, "torch.compile model and imagination, for GPUs (ours)", free=True)
-
     def __post_init__(self):
         """Raises ValueError at wrong types and values out of range, also those of a checkpoint."""
         for field in dataclasses.fields(self):
@@ -295,12 +292,10 @@ def stack(layer, sizes, shapes):
 class MLP(nn.Sequential):
     """`layers` hidden layers with ELU, then a linear one, to a number (...,) or, given `dims`, to
     a normal's mean and standard deviation in (0.1, 2.1), (..., dims) each. fp32 out."""
-
     def __init__(self, inputs, units, layers, dims=None):
         hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
         super().__init__(*hidden, nn.Linear(units, 2 * dims if dims else 1))
         self.dims = dims
-
     def forward(self, x):
         x = super().forward(x).float()
         if not self.dims:
@@ -325,36 +320,29 @@ def latent_code(mean, logvar):
 class PerFrame(nn.Module):
     """Layers for the last `dims` dimensions; all before them are one batch. fp32 out.
     In the encoders and decoders, d is the number of channels of the image's convolution."""
-
     def __init__(self, dims, *layers):
         super().__init__()
         self.dims, self.net = dims, nn.Sequential(*layers)
-
     def forward(self, x):
         return self.net(x.flatten(0, -1 - self.dims)).float().unflatten(0, x.shape[:-self.dims])
-
     def encode(self, image):
         """→ dict of `embed`; a β-VAE's is a latent_code"""
         return dict(embed=self(image))
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
-
     def __init__(self, z_dim=20, depth=32):
         d, shapes = depth, [(4, 2, 1)] * 4 + [(4,)]                           # 32, 16, 8, 4, 1
         super().__init__(3, *stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes),
                          nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
         self.apply(kaiming)
-
     def forward(self, image):
         return super().forward(image).chunk(2, -1)
-
     def encode(self, image):
         return latent_code(*self(image))
 
 class BetaVAEDecoder(PerFrame):
     """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
-
     def __init__(self, feat_dim, z_dim=20, depth=32):
         d, shapes = depth, [(4,)] + [(4, 2, 1)] * 3                           # 4, 8, 16, 32, 64
         super().__init__(1, nn.Linear(feat_dim, z_dim), nn.ELU(), nn.Linear(z_dim, 8 * d), nn.ELU(),
@@ -386,7 +374,6 @@ class RSSM(nn.Module):
         reward        0      r that came with o_1
       is_first        1      0                     (forgets h, z *and* the action)
           post       s_0    s_1"""
-
     def __init__(self, action_dim, embed_dim, stoch=50, deter=200, hidden=200):
         super().__init__()
         self.action_dim = action_dim
@@ -396,16 +383,13 @@ class RSSM(nn.Module):
         self.norm = nn.LayerNorm(3 * deter)
         self.prior_net = MLP(deter, hidden, 1, stoch)
         self.post_net = MLP(deter + embed_dim, hidden, 1, stoch)
-
     @staticmethod
     def feat(state):
         """What decoder, heads, actor and critic see: [z_t, h_t], (..., S + D)"""
         return torch.cat([state["stoch"], state["deter"]], -1)
-
     def initial(self, batch):
         """The zero state for a batch."""
         return {key: self.norm.weight.new_zeros(batch, size) for key, size in self.sizes.items()}
-
     def recur(self, state, action):
         """h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm. Zeros pad an action too short."""
         x = torch.cat([state["stoch"], action], -1) if self.action_dim else state["stoch"]
@@ -414,26 +398,21 @@ class RSSM(nn.Module):
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         return torch.lerp(state["deter"], candidate, torch.sigmoid(update - 1))         # (B, D)
-
     def draw(self, net, inputs, deter):
         """A state around h_t: `net`'s distribution, a sample."""
         mean, std = net(inputs)
         return dict(deter=deter, mean=mean, std=std, stoch=gaussian_sample(mean, std))
-
     def prior(self, deter):
         """ẑ_t ~ p(ẑ_t | h_t)"""
         return self.draw(self.prior_net, deter, deter)
-
     def posterior(self, deter, embed):
         """z_t ~ q(z_t | h_t, embed_t)"""
         return self.draw(self.post_net, torch.cat([deter, embed], -1), deter)
-
     def step(self, state, action, embed, is_first):
         """One filtering step; where is_first (B,) is set, state and action are forgotten."""
         keep = 1 - is_first.to(embed.dtype)[:, None]
         state = {key: value * keep for key, value in state.items()}
         return self.posterior(self.recur(state, action * keep if self.action_dim else None), embed)
-
     def observe(self, embed, action, is_first):
         """Filter windows: (B, T, Z), (B, T, A), (B, T) → post, prior, dicts of (B, T, ·)."""
         state, states = self.initial(len(embed)), []
@@ -446,12 +425,10 @@ class RSSM(nn.Module):
 class StackedRSSM(RSSM):
     """APV's: it sees [embed_t, s_t of the action-free RSSM `below`], whose KL has weight 0 (APV).
     That s_t is part of a state too, as `below` (..., S + D); imagination goes on without it."""
-
     def __init__(self, action_dim, embed_dim, stoch=50, deter=200, hidden=200):
         super().__init__(action_dim, embed_dim + stoch + deter, stoch, deter, hidden)
         self.below = RSSM(0, embed_dim, stoch, deter, hidden)
         self.sizes["below"] = stoch + deter
-
     def step(self, state, action, embed, is_first):
         stoch, deter = state["below"].split([self.sizes["stoch"], self.sizes["deter"]], -1)
         below = self.feat(self.below.step(dict(stoch=stoch, deter=deter), None, embed, is_first))
@@ -460,7 +437,6 @@ class StackedRSSM(RSSM):
 
 class IntrinsicBonus(nn.Module):
     """APV's reward for the unusual: mean distance to the k nearest among the latest states."""
-
     def __init__(self, feat_dim, k=16, window=5, size=4096, dims=128, momentum=0.99):
         super().__init__()
         self.k, self.window, self.momentum = k, window, momentum
@@ -468,7 +444,6 @@ class IntrinsicBonus(nn.Module):
         self.register_buffer("queue", torch.zeros(size, dims))                # newest first
         self.register_buffer("filled", torch.tensor(0))
         self.register_buffer("scale", torch.ones(()))                         # running mean of |x|
-
     @torch.no_grad()
     def forward(self, feat):
         """feat (B, T, S + D) → (B, T − window + 1): row t is of rows t … t + window − 1."""
@@ -486,7 +461,6 @@ class IntrinsicBonus(nn.Module):
 
 class VideoPredictor(nn.Module):
     """The action-free video prediction model of Eq. (1), trained by Eq. (2)."""
-
     def __init__(self, cfg, action_dim=0):
         super().__init__()
         self.cfg, vae = cfg, cfg.encoder == "beta_vae"
@@ -496,20 +470,17 @@ class VideoPredictor(nn.Module):
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
         self.rssm = rssm(action_dim, cfg.z_dim if vae else 32 * d, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
-
     def forward(self, batch):
         """Filter → dict of code (of encode), post, prior, feat."""
         code = self.encoder.encode(batch["image"])
         post, prior = self.rssm.observe(code["embed"], batch.get("action"), batch["is_first"])
         return dict(code=code, post=post, prior=prior, feat=self.rssm.feat(post))
-
     def terms(self, out, batch):
         """Loss terms of each step, (B, T), nats, but for the KL."""
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
         image, code = squared_error(batch["image"], self.decoder(out["feat"]), 3), out["code"]
         vae = dict(disentangle=beta_vae_kl(code["mean"], code["logvar"])) if "mean" in code else {}
         return dict(image=image) | vae
-
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
         teacher: latent_code of the same images from the frozen teacher, or None."""
@@ -530,7 +501,6 @@ class VideoPredictor(nn.Module):
 
 class WorldModel(VideoPredictor):
     """The world model of Eq. (4): Eq. (1) with actions, a reward and a discount head; Eq. (5)."""
-
     def __init__(self, cfg, action_dim):
         super().__init__(cfg, action_dim)
         self.scales = dict(image=1.0, kl=cfg.alpha, disentangle=cfg.beta, reward=cfg.reward_scale,
@@ -538,7 +508,6 @@ class WorldModel(VideoPredictor):
         self.reward = MLP(cfg.stoch + cfg.deter, cfg.units, 2)        # r̂, mean of a unit Gaussian
         self.discount = MLP(cfg.stoch + cfg.deter, cfg.units, 3)                  # the logit of γ̂
         self.bonus = IntrinsicBonus(cfg.stoch + cfg.deter) if cfg.bonus else None
-
     @torch.no_grad()
     def carry_over(self, video):
         """Take over a VideoPredictor's encoder, decoder and RSSM (in a stack, as the one below).
@@ -546,7 +515,6 @@ class WorldModel(VideoPredictor):
         own = nn.ModuleList([self.encoder, self.decoder, getattr(self.rssm, "below", self.rssm)])
         for weight, value in zip(own.parameters(), video.parameters(), strict=True):
             weight[..., :value.shape[-1]] = value
-
     def terms(self, out, batch):
         """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
         feat = out["feat"][:, :batch["reward"].shape[1]]  # the last rows have no intrinsic bonus
@@ -560,7 +528,6 @@ class WorldModel(VideoPredictor):
 
 class ActorCritic(nn.Module):
     """Actor π(a | s), critic v(s), and a slow copy of the critic that gives the targets."""
-
     def __init__(self, cfg, action_dim):
         super().__init__()
         self.cfg, feat_dim = cfg, cfg.stoch + cfg.deter
@@ -568,16 +535,13 @@ class ActorCritic(nn.Module):
         self.critic = MLP(feat_dim, cfg.units, 3)
         self.slow_critic = MLP(feat_dim, cfg.units, 3).requires_grad_(False)      # only copied
         self.copy_critic()
-
     def copy_critic(self):
         """Slow critic ← critic."""
         self.slow_critic.load_state_dict(self.critic.state_dict())
-
     def policy(self, feat):
         """→ mean in (−1, 1) and std of the normal of actions, (..., A)"""
         mean, std = self.actor(feat)
         return torch.tanh(mean), std
-
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
               t        0     1    …   H−1      H
@@ -598,7 +562,6 @@ class ActorCritic(nn.Module):
             state = model.rssm.prior(model.rssm.recur(state, clip_action(raw)))
             feats.append(model.rssm.feat(state))
         return torch.stack(feats), torch.stack(log_probs), torch.stack(entropies)
-
     def losses(self, model, start, start_discount):
         """start: dict of (N, ·) detached states; start_discount (N,): their true γ_0.
         Returns (actor_loss, critic_loss, metrics). The actor's graph runs through the world model,
@@ -631,10 +594,8 @@ def freeze(encoder):
 
 class Adam(torch.optim.Adam):
     """The optimiser of a module's parameters (published)."""
-
     def __init__(self, module, lr):
         super().__init__(module.parameters(), lr=lr, eps=1e-5)
-
     def load_state_dict(self, state):
         """The moments; the rest is the Config's. Torch itself would take another model's."""
         super().load_state_dict(dict(state, param_groups=self.state_dict()["param_groups"]))
@@ -674,7 +635,6 @@ def check_finite(metrics):
 
 class Agent:
     """World model, actor-critic, frozen teacher and optimisers: what an online run trains."""
-
     def __init__(self, cfg, action_dim, device, teacher=None):
         self.cfg, self.action_dim, self.device, self.teacher = cfg, action_dim, device, teacher
         self.model = WorldModel(cfg, padded_actions(cfg, action_dim)).to(device)
@@ -685,7 +645,6 @@ class Agent:
         if cfg.compile:
             self.model.compile()
             self.behaviour.imagine = torch.compile(self.behaviour.imagine)
-
     @torch.no_grad()
     def act(self, image, action, state, explore):
         """Decide. image: uint8 (N, 64, 64, 3); action: the previous one, (N, A); state: None first.
@@ -697,7 +656,6 @@ class Agent:
         state = self.model.rssm.step(state, action, embed, is_first)
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
-
     @torch.no_grad()
     def taught(self, rows):
         """What the frozen teacher makes of an episode's images: {TEACHER: (T, Z)}, or {}."""
@@ -706,7 +664,6 @@ class Agent:
         image = torch.from_numpy(np.stack([row["image"] for row in rows])).to(self.device)
         code = self.teacher(preprocess(image))
         return {key: x.cpu().numpy() for key, x in zip(TEACHER, code, strict=True)}
-
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
         update: index of this step. probe: measure distillation's own gradient at the encoder."""
@@ -738,11 +695,9 @@ class Agent:
         for name, loss in zip(("actor", "critic"), losses, strict=True):
             metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, clip)
         return {key: value.detach() for key, value in metrics.items()}
-
     def state_dict(self):
         return dict(model=self.model.state_dict(), behaviour=self.behaviour.state_dict(),
                     optimizers={name: opt.state_dict() for name, opt in self.optimizers.items()})
-
     def load_state_dict(self, state):
         self.model.load_state_dict(state["model"])
         self.behaviour.load_state_dict(state["behaviour"])
@@ -808,20 +763,17 @@ class Replay:
         a window                [. . . . . . F . . .]
     Only an index is in memory. A file is an array of rows that `np.load` opens: an episode's images
     are np.load(path)["image"]. Fields that are not in `dtype` are left unread."""
-
     def __init__(self, folder, dtype=VIDEO, capacity=None):
         self.folder, self.dtype, self.capacity = Path(folder), dtype, capacity
         # All files: a checkpoint may need those that the ones after it pushed out.
         self._hold([(path, len(self.read(path))) for path in sorted(self.folder.glob("*.npy"))])
         last = self.paths[-1].stem if self.paths else ""
         self.next_index = int(last) + 1 if last.isdecimal() else 0
-
     def _hold(self, episodes):
         """Index (path, length) pairs."""
         self.episodes, self.paths = episodes, [path for path, _ in episodes]
         self.ends = np.cumsum([length for _, length in episodes], dtype=int).tolist()
         self.rows = self.ends[-1] if episodes else 0
-
     def read(self, path):
         """An episode's rows, mapped, not read. UserError unless it has the fields of `dtype`."""
         with reading(path, f"episode with {', '.join(self.dtype.names)}", "remove it"):
@@ -832,7 +784,6 @@ class Replay:
                 if rows.dtype[name] != self.dtype[name]:
                     raise ValueError(f"{name} is {rows.dtype[name]}, not {self.dtype[name]}")
         return rows
-
     def add(self, rows, **more):
         """Append a finished episode, a list of `make_row`; the oldest beyond capacity go.
         more: fields that these do not have, arrays (T, ...)."""
@@ -846,16 +797,13 @@ class Replay:
         while self.capacity and self.rows - self.ends[0] >= self.capacity:
             self._hold(self.episodes[1:])
         self.next_index += 1
-
     def prune(self):
         """Delete files not in the index, once no checkpoint needs them."""
         for path in set(self.folder.glob("*.npy")) - set(self.paths):
             path.unlink()
-
     def state_dict(self):
         """Which episodes there are: the first one and the next to come."""
         return dict(first=self.next_index - len(self.paths), next=self.next_index)
-
     def load_state_dict(self, state):
         """Return to those episodes; later ones, of a run cut off, go."""
         numbers, self.next_index = range(state["first"], state["next"]), state["next"]
@@ -864,7 +812,6 @@ class Replay:
         if len(self.paths) != len(numbers):
             raise UserError(f"{self.folder} lacks episodes of its checkpoint; start over: --fresh")
         self.prune()
-
     def window(self, start, length):
         """Rows start … start + length − 1: dict of (T, ...)"""
         pieces = []
@@ -874,7 +821,6 @@ class Replay:
             pieces.append(rows)
             start, length = start + len(rows), length - len(rows)
         return {key: np.concatenate([rows[key] for rows in pieces]) for key in self.dtype.names}
-
     def sample(self, batch_size, length, rng):
         """Dict of (B, T, ...); windows begin is_first."""
         starts = rng.integers(0, self.rows - length + 1, batch_size)
@@ -1261,7 +1207,6 @@ def read_checkpoint(path):
 
 class Run:
     """A run's folder: checkpoint.pt, config.json, metrics.jsonl, TensorBoard events."""
-
     def __init__(self, cfg, stage, fresh=False):
         if cfg.eta_delay < 0:
             cfg = replace(cfg, eta_delay=cfg.eta_decay * (family(cfg.src) != family(cfg.dst)))
@@ -1283,7 +1228,6 @@ class Run:
         if differ:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
-
     def save(self, trainer):
         """Write the checkpoint, whole or not at all."""
         cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
@@ -1295,7 +1239,6 @@ class Run:
             file.write(json.dumps(vars(self.cfg), indent=2).encode())
         with atomic(self.checkpoint) as file:
             file.write(buffer.getbuffer())
-
     def restore(self, trainer):
         """Trainer, random numbers, and the log as it was then."""
         with reading(self.checkpoint):
@@ -1376,11 +1319,9 @@ def mean_metrics(rows):
 class Trainer:
     """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics or
     None. What changes: `parts` that have a state_dict, and `counters`; `batch`: the latest."""
-
     def state_dict(self):
         parts = {name: getattr(self, name).state_dict() for name in self.parts}
         return parts | {name: getattr(self, name) for name in self.counters}
-
     def load_state_dict(self, state):
         for name in self.parts:
             getattr(self, name).load_state_dict(state[name])
@@ -1393,7 +1334,6 @@ class VideoTrainer(Trainer):
     """Stage 2, Algorithm 1 lines 4–8: the video predictor. Progress is in updates."""
     unit, shown, parts = "updates", ("image", "kl", "disentangle"), ("model", "optimizer")
     counters, chunk = ("progress", "metrics"), 100                            # updates per log row
-
     def __init__(self, cfg, videos, device):
         self.cfg, self.videos, self.device = cfg, videos, device
         self.model = VideoPredictor(cfg).to(device)
@@ -1401,7 +1341,6 @@ class VideoTrainer(Trainer):
             self.model.compile()
         self.optimizer = Adam(self.model, cfg.model_lr)
         self.progress, self.metrics, self.total = 0, [], cfg.pretrain_updates
-
     def update(self, batch):
         """One step of Eq. (2) on numpy arrays (B, T, ...) → metrics."""
         batch = to_device(batch, self.device)
@@ -1409,7 +1348,6 @@ class VideoTrainer(Trainer):
             loss, metrics = self.model.loss(self.model(batch), batch)
         norm = gradient_step(self.optimizer, loss, self.cfg.grad_clip)
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
-
     def advance(self):
         """An update → after every `chunk` of them, and at the end, a row of the log."""
         cfg, rng = self.cfg, np.random.default_rng([self.cfg.seed, self.progress])  # not saved
@@ -1427,7 +1365,6 @@ class AgentTrainer(Trainer):
     recurrent state is in it; the colours, η and all seeds follow from the counters."""
     unit, shown = "env steps", ("train_return", "eval_return", "image", "reward", "kl", "eta")
     parts, counters = ("agent", "replay"), ("progress", "decisions", "updates", "episodes")
-
     def __init__(self, cfg, folder, device, teacher=None):
         self.cfg = cfg
         self.envs = config_envs(cfg, cfg.dst)
@@ -1436,7 +1373,6 @@ class AgentTrainer(Trainer):
         self.replay = Replay(folder / "episodes", rows, cfg.replay_capacity)
         self.progress = self.decisions = self.updates = self.episodes = 0
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
-
     def learn(self, env_steps):
         """The updates due after a decision in each environment that plays → list of metrics."""
         cfg, before, metrics = self.cfg, self.decisions, []
@@ -1455,7 +1391,6 @@ class AgentTrainer(Trainer):
             metrics.append(check_finite(update))
             self.updates += 1
         return metrics
-
     def play(self):
         """An episode in each environment, learning on the way → see play_episodes, and the metrics
         of the updates. It ends with the simulator's, at the colour switch, or with the run."""
@@ -1471,7 +1406,6 @@ class AgentTrainer(Trainer):
             metrics.extend(self.learn(env_steps))
             return self.progress >= limit
         return play_episodes(self.envs, policy, seeds, self.phase, each), metrics
-
     def advance(self):
         """An episode in each environment, and an evaluation when one is due → a row of the log."""
         cfg, start = self.cfg, self.progress
@@ -1490,7 +1424,6 @@ class AgentTrainer(Trainer):
             row["eval_return"] = result.pop("mean")
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
-
     def state_dict(self):
         """And the teacher, so that the run needs no other file."""
         net = self.agent.teacher
@@ -1564,9 +1497,7 @@ def find_teacher(cfg, device):
     if cfg.src == cfg.dst:
         raise UserError(f"source and target are both {cfg.src}; choose another --src")
     if path is None:
-        others = {p.parts[-4] for p in own.parent.parent.parent.glob(f"*/{cfg.method}/*/*.pt")}
-        more = f" (or take one that exists: --src {min(others)})" if others else ""
-        raise UserError(f"no teacher in {own.parent}; {command}{more}")
+        raise UserError(f"no teacher in {own.parent}; {command}")
     saved, model, state = load_model(path, device)
     done = state["trainer"]["progress"]
     if state["stage"] != "pretrain" or saved.encoder != ("beta_vae" if cfg.eta else cfg.encoder):
@@ -1639,6 +1570,9 @@ def evaluate(cfg, folder):
     replay, said = Replay(folder / "evaluation", row_type(agent.action_dim)), []
     for name, policy in (("", agent), ("random_", None)):                  # which need not see
         with contextlib.closing(config_envs(cfg, cfg.dst, pixels=bool(policy))) as envs:
+            if envs.single_action_space.shape != (agent.action_dim,):
+                raise UserError(f"{folder} has {agent.action_dim} actions, unlike its {cfg.dst}; "
+                                "its checkpoint was altered: train it again with --fresh")
             more = evaluate_agent(cfg, policy, envs, phase, replay if policy else None)
         result |= {name + key: value for key, value in more.items()}
         success = f", success {more['success']:.0%}" if "success" in more else ""
