@@ -864,6 +864,9 @@ PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
 MATERIALS = dict(grid="floor", self="body")  # dm_control's names
 TRAINING, EVALUATION = 0, 1  # streams of episode_seed
+if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its last lines
+    for name in (*TASKS, *OTHER_TASKS):
+        gym.register(f"DisWM/{name}-v0", "diswm:make_env", kwargs=dict(task=name))
 
 def family(task):
     """"dmc", "pusher", "drawer" or "gymnasium": a transfer between two of them crosses domains."""
@@ -883,26 +886,21 @@ def check_task(task):
                         "tasks of gymnasium and gymnasium-robotics, like FetchReach-v4", code=2)
 
 class DMControlEnv(gym.Env):
-    """A task of dm_control.suite as a gymnasium.Env with a flat state observation."""
-
+    """A task of dm_control.suite as a gymnasium.Env with a flat state, MuJoCo's model and data."""
     def __init__(self, domain, task):
         self.env = suite.load(domain, task, environment_kwargs=dict(flat_observation=True))
         spec, size = self.env.action_spec(), self.env.observation_spec()["observations"].shape
         self.action_space = gym.spaces.Box(np.float32(spec.minimum), np.float32(spec.maximum))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, size, np.float64)
-        # The raw mujoco.MjModel and MjData, under the names that gymnasium's MuJoCo tasks use.
         self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr
-
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
             self.env.task.random.seed(seed)
         return self.env.reset().observation["observations"], {}
-
     def step(self, action):
-        """A time limit truncates, only a zero discount terminates."""
         step = self.env.step(action)
-        obs, terminated = step.observation["observations"], step.last() and step.discount == 0
+        obs, terminated = step.observation["observations"], step.discount == 0  # 1 at a time limit
         return obs, float(step.reward), terminated, step.last() and not terminated, {}
 
 def drawer_world(task):
@@ -912,7 +910,6 @@ def drawer_world(task):
     grid = dict(builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mark=mujoco.mjtMark.mjMARK_EDGE,
                 rgb1=(0.1, 0.2, 0.3), rgb2=(0.2, 0.3, 0.4), width=300, height=300)
     tops = dict(train=grid, shifted={"file": path + "wood.png"}, eval={"file": path + "metal.png"})
-
     class DrawerWorld(metaworld.env_dict.ALL_V3_ENVIRONMENTS[task.replace("_", "-") + "-v3"]):
         def _initialize_simulation(self):
             spec = mujoco.MjSpec.from_file(self.fullpath)
@@ -923,7 +920,6 @@ def drawer_world(task):
             model = spec.compile()
             model.mat_reflectance[:] = 0  # 17 ms a frame, for no visible difference
             return model, mujoco.MjData(model)
-
         def reset(self, *, seed=None, options=None):
             if seed is not None:
                 self.seed(seed)                                               # reset ignores it
@@ -937,8 +933,8 @@ def drawer_world(task):
     # Its own benchmark sets a goal from a list; this draws one at each reset, from the seed.
     env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
     # DEVIATION: published from 0.96 above, where half of version 3's drawer is out of sight.
-    above = dict(distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
-    env.mujoco_renderer.default_cam_config = above
+    env.mujoco_renderer.default_cam_config = dict(
+        distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
     return env
 
 def bare_simulator(task):
@@ -947,23 +943,18 @@ def bare_simulator(task):
         return DMControlEnv(*TASKS[task]), 1000
     if family(task) == "drawer":
         return drawer_world(task), 200
-    name = "Pusher-v5" if task == "pusher" else task
-    env = gym.make(name, disable_env_checker=True, max_episode_steps=-1).unwrapped
     if task == "pusher":                                                      # published
         above = dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2))
-        env.mujoco_renderer.default_cam_config = above
-    return env, gym.spec(name).max_episode_steps
+        return gym.make("Pusher-v5", default_camera_config=above).unwrapped, 100
+    return gym.make(task, disable_env_checker=True).unwrapped, gym.spec(task).max_episode_steps
 
 class ActionRepeat(gym.Wrapper):
     """Hold an action for n simulator steps, sum the rewards; info["env_steps"] counts the steps.
     info["success"], where the task tells, is true if it was reached at any of them."""
-
     def __init__(self, env, n):
         super().__init__(env)
         self.n = n
-
     def step(self, action):
-        """Stops early where the episode ends."""
         # DEVIATION: the published code repeats in two wrappers (really 4) and doubles rewards.
         total, steps, terminated, truncated, reached = 0.0, 0, False, False, []
         while steps < self.n and not (terminated or truncated):
@@ -1004,7 +995,6 @@ def color_groups(task, model):
 class ColorDistractor(gym.Wrapper):
     """Each episode, draw the colours of groups from a random stream of their own.
     reset(options={"phase": …}) changes the phase from then on. Only what is rendered changes."""
-
     def __init__(self, env, task, phase, colors="published", half_range=0.2, step_std=0.0):
         super().__init__(env)
         self.phase, self.step_std, self.rng = phase, step_std, np.random.default_rng()
@@ -1012,38 +1002,29 @@ class ColorDistractor(gym.Wrapper):
         self.original = [array[rows, :3] for _, array, rows in self.groups]   # copies
         original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
         tint = np.arange(len(original))[:, None] >= (task == "pusher")        # black: its object
-        self.boxes = {name: np.multiply(color_box(name, original, colors, half_range), tint)
-                      for name in PHASES}
-
+        self.boxes = {p: tint * color_box(p, original, colors, half_range) for p in PHASES}
     def paint(self, colors):
-        """Give each group its colour, or its rows theirs."""
         self.current = colors
         for (_, array, rows), color in zip(self.groups, colors, strict=True):
             array[rows, :3] = color
-
     def reset(self, *, seed=None, options=None):
-        """New colours; a seed determines them."""
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
-        self.phase = (options or {}).get("phase", self.phase)
+        options = {"phase": self.phase} | (options or {})
+        self.phase = options["phase"]
         colors = self.rng.uniform(*self.boxes[self.phase])
         self.paint(self.original if self.phase == "none" else colors)
-        return self.env.reset(seed=seed, options=(options or {}) | {"phase": self.phase})
-
+        return self.env.reset(seed=seed, options=options)
     def step(self, action):
-        """Optionally, the colours walk at random within the box."""
         if self.step_std and self.phase != "none":
-            rgb = np.float32(self.current)                                    # as the model does
-            walk = rgb + self.rng.normal(0, self.step_std, rgb.shape)
+            walk = self.rng.normal(np.float32(self.current), self.step_std)   # as MuJoCo rounds
             self.paint(np.clip(walk, *self.boxes[self.phase]))
         return self.env.step(action)
 
 class Pixels(gym.ObservationWrapper):
-    """Observe what a camera sees, uint8 (size, size, 3), through a renderer of one's own.
-    mujoco.Renderer makes its GL context current before each use; the simulators' render() does not,
-    and then two of them in one process silently show each other's textures."""
+    """Observe what a camera sees, uint8 (size, size, 3). By mujoco.Renderer, since the simulators'
+    render() keeps whichever GL context was last: two in a process show each other's textures."""
     metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
-
     def __init__(self, env, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
@@ -1060,16 +1041,13 @@ class Pixels(gym.ObservationWrapper):
             model.vis.quality.offsamples = 0  # half of the rest, for 1–2 / 255
         self.renderer = mujoco.Renderer(model, size, size)
         atexit.register(self.renderer.close)  # one that is open at exit prints GL errors
-
     def reset(self, *, seed=None, options=None):
-        """The terrain of quadruped_escape is another one in each episode."""
         _, info = self.env.reset(seed=seed, options=options)
-        for index in range(self.unwrapped.model.nhfield):
+        for index in range(self.unwrapped.model.nhfield):                     # quadruped's terrain
             self.renderer._gl_context.make_current()
             mujoco.mjr_uploadHField(self.unwrapped.model, self.renderer._mjr_context, index)
-        return self.observation(None), info
-
-    def observation(self, observation):
+        return self.render(), info
+    def observation(self, observation=None):
         data = self.unwrapped.data
         if hasattr(self.unwrapped, "_render_callback"):                       # puts Fetch's goal
             warmstart = data.qacc_warmstart.copy()
@@ -1077,12 +1055,8 @@ class Pixels(gym.ObservationWrapper):
             data.qacc_warmstart[:] = warmstart  # else looking would change, in bits, what happens
         self.renderer.update_scene(data, camera=self.camera)
         return self.renderer.render()
-
-    def render(self):
-        return self.observation(None)
-
+    render = observation
     def close(self):
-        """Free the GL context, then the simulator."""
         atexit.unregister(self.renderer.close)
         self.renderer.close()
         super().close()
@@ -1090,11 +1064,10 @@ class Pixels(gym.ObservationWrapper):
 def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colors="published",
              color_range=0.2, color_step_std=0.0, fast_render=False, size=64, pixels=True):
     """The one env stack: simulator, actions in [−1, 1], time limit, action repeat, colours, pixels.
-    task: of dm_control, pusher, drawer_open, drawer_close, or a Gymnasium id. phase: "train",
-    "shifted" (after the midpoint), "eval" (drawers: metal; else the shifted one) or "none" (the
-    task's own look). time_limit: simulator steps, 0 for the task's own. pixels=False leaves the
-    state observation, flat, and renders nothing. Returns a gymnasium.Env of uint8 (size, size, 3)
-    images. UserError: unknown task or phase, one without MuJoCo or with discrete actions, no GL."""
+    task: of TASKS, OTHER_TASKS, or a Gymnasium id. phase: "train", "shifted" (after the midpoint),
+    "eval" (drawers: metal; others: as shifted), "none" (the task's own look). time_limit: simulator
+    steps, 0: the task's own. Returns a gymnasium.Env of uint8 (size, size, 3) images or, without
+    pixels, flat states. UserError: unknown task or phase, no MuJoCo, discrete actions, no GL."""
     check_task(task)
     if phase not in PHASES:
         raise UserError(f"unknown phase '{phase}'; there are: {', '.join(PHASES)}", code=2)
@@ -1104,28 +1077,21 @@ def make_env(task, *, phase="train", seed=0, action_repeat=2, time_limit=0, colo
         reason = (str(error).splitlines() or [""])[0]
         raise UserError(f"{task} cannot be made ({reason}); run: pip install --force-reinstall -r "
                         "requirements.txt") from error
-    if not isinstance(getattr(env, "model", None), mujoco.MjModel) or not isinstance(
-            env.action_space, gym.spaces.Box):
+    has_model = isinstance(getattr(env, "model", None), mujoco.MjModel)
+    if not (has_model and isinstance(env.action_space, gym.spaces.Box)):
         raise UserError(f"{task} has no MuJoCo model to render or no continuous actions; choose "
                         "another, such as HalfCheetah-v5")
     env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
     env = gym.wrappers.TimeLimit(env, time_limit or limit or 1000)
     env = ActionRepeat(env, action_repeat)
     env = ColorDistractor(env, task, phase, colors, color_range, color_step_std)
-    if pixels:
-        try:
-            env = Pixels(env, size, fast_render)
-        except (AttributeError, ImportError, RuntimeError) as error:
-            raise UserError(f"MuJoCo with MUJOCO_GL={os.environ['MUJOCO_GL']} cannot render "
-                            f"({error}); {GL_HINT}") from error
-    elif isinstance(env.observation_space, gym.spaces.Dict):
-        env = gym.wrappers.FlattenObservation(env)
+    try:
+        env = Pixels(env, size, fast_render) if pixels else gym.wrappers.FlattenObservation(env)
+    except (AttributeError, ImportError, RuntimeError) as error:
+        raise UserError(f"MuJoCo with MUJOCO_GL={os.environ['MUJOCO_GL']} cannot render "
+                        f"({error}); {GL_HINT}") from error
     env.reset(seed=seed)
     return env
-
-if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its last lines
-    for name in (*TASKS, *OTHER_TASKS):
-        gym.register(f"DisWM/{name}-v0", "diswm:make_env", kwargs=dict(task=name))
 
 def config_env(cfg, task, phase, **kwargs):
     """make_env with the values of a Config."""
@@ -1157,10 +1123,9 @@ def episode_seed(seed, stream, index):
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
 
 def play_episodes(envs, policy, seeds, phase, each=None):
-    """Play an episode in each environment → [(rows (see make_row), return, success), …].
-    policy(images, actions, state) → (actions, state), given the previous actions and, at first,
-    None. each(env_steps), of those that still play, is called after each decision; where it
-    returns true, all are cut. Success is None where the task does not tell."""
+    """Play an episode in each environment → [(rows of make_row, return, success or None), …].
+    policy(images, actions, state) → (actions, state), of the previous actions and, at first, None.
+    each(env_steps), of those that still play, follows each decision; if true, all are cut."""
     images, _ = envs.reset(seed=seeds, options=dict(phase=phase))
     actions, state = np.zeros(envs.action_space.shape, np.float32), None
     episodes = [[make_row(*pair, first=True)] for pair in zip(images, actions, strict=True)]
