@@ -1662,9 +1662,8 @@ def to_picture(image):
 
 @torch.no_grad()
 def latent_traversal(model, batch):
-    """Vary one latent at a time in the first image of one window (1, T, ...) (paper, Fig. 5).
-    Returns pictures, uint8 (Z, 1 + values, 64, 64, 3), first the reconstruction; and each latent's
-    KL in nats, averaged over the window, (Z,)."""
+    """Vary one latent at a time (paper, Fig. 5) in the first image of a window (1, T, ...) → uint8
+    (Z, 1 + values, 64, 64, 3), first the reconstruction; each latent's mean KL, nats, (Z,)."""
     out = model(batch)
     mean, logvar = out["code"]["mean"][0], out["code"]["logvar"][0]           # (T, Z)
     latents = torch.arange(mean.shape[1])
