@@ -1562,24 +1562,22 @@ def to_picture(image):
 
 @torch.no_grad()
 def latent_traversal(model, batch):
-    """Vary one latent at a time (paper, Fig. 5). batch: one window (1, T, ...), preprocessed.
-    𝐳 of the first image, with z_i = v, goes through posterior (mean) and decoder: without a past,
-    all that the model knows is 𝐳. Returns pictures, uint8 (Z, 1 + values, 64, 64, 3), first the
-    reconstruction; and each latent's KL in nats, averaged over the window, (Z,)."""
+    """Vary one latent at a time (paper, Fig. 5) in the first image of a window (1, T, ...) → uint8
+    (Z, 1 + values, 64, 64, 3), first the reconstruction; each latent's mean KL, nats, (Z,)."""
     out = model(batch)
-    mean, logvar = (out["code"][key][0] for key in ("mean", "logvar"))        # (T, Z)
-    values, size = torch.tensor(TRAVERSAL, device=mean.device), mean.shape[-1]
-    z = mean[0].repeat(size, 1 + len(values), 1)                             # (Z, 1 + values, Z)
-    z[torch.arange(size), 1:, torch.arange(size)] = values.to(z.dtype)
-    deter = out["post"]["deter"][0, 0].expand(*z.shape[:2], -1)
-    state = model.rssm.posterior(deter, z)
-    pictures = to_picture(model.decoder(torch.cat([state["mean"], deter], -1)))
-    return pictures, beta_vae_kl(mean[..., None], logvar[..., None]).mean(0).cpu().numpy()
+    mean, logvar = out["code"]["mean"][0], out["code"]["logvar"][0]           # (T, Z)
+    latents = torch.arange(mean.shape[1])
+    z = mean[0].repeat(len(latents), 1 + len(TRAVERSAL), 1)                   # (Z, 1 + values, Z)
+    z[latents, 1:, latents] = z.new_tensor(TRAVERSAL)
+    deter = out["post"]["deter"][0, 0].expand(*z.shape[:2], -1)               # 𝐳 is all it knows
+    feat = torch.cat([model.rssm.posterior(deter, z)["mean"], deter], -1)
+    kl = beta_vae_kl(mean[..., None], logvar[..., None])                      # (T, Z): of each
+    return to_picture(model.decoder(feat)), kl.mean(0).cpu().numpy()
 
 @torch.no_grad()
 def open_loop(model, batch, context=5):
-    """Filter `context` images, predict the others unseen. batch: one window (1, T, ...).
-    The actions are the window's own. Returns uint8 (3, T, 64, 64, 3): truth, model, error."""
+    """Filter `context` images of one window (1, T, ...), predict the others from its actions alone.
+    Returns uint8 (3, T, 64, 64, 3): truth, model, error."""
     out = model({key: value[:, :context] for key, value in batch.items()})
     state, feats = {key: value[:, -1] for key, value in out["post"].items()}, [out["feat"]]
     for t in range(context, batch["image"].shape[1]):
@@ -1587,38 +1585,38 @@ def open_loop(model, batch, context=5):
         state = model.rssm.prior(model.rssm.recur(state, action))
         feats.append(model.rssm.feat(state)[:, None])
     truth, prediction = batch["image"][0], model.decoder(torch.cat(feats, 1))[0].clamp(-0.5, 0.5)
-    return np.stack([to_picture(x) for x in (truth, prediction, (prediction - truth) / 2)])
+    return to_picture(torch.stack([truth, prediction, (prediction - truth) / 2]))
 
 def labelled_frames(cfg):
     """Random episodes of `cfg.dst` whose colours are drawn anew for each frame, each channel by
     itself from the union of both phases' intervals. Returns images, uint8 (N, 64, 64, 3), factors
     (N, K): colours that show, joint positions, m, and angles, rad, in (−π, π]; and their names."""
     images, factors, ends, rng = [], [], [], np.random.default_rng(cfg.seed)
-    with contextlib.closing(config_env(cfg, cfg.dst, "none")) as env:
+    with config_env(cfg, cfg.dst, "none") as env:
         model, data, painter = env.unwrapped.model, env.unwrapped.data, env.env
         original = np.array([rgb[0] for rgb in painter.original]).reshape(-1, 3)
         boxes = [color_box(phase, original, cfg.colors, cfg.color_range) for phase in PHASES[:2]]
-        def rendered(group, value):
-            painter.paint(np.where(np.arange(len(original))[:, None] == group, value, original))
+        def rendered(colors):
+            painter.paint(colors)
             return env.render()
-        shown = [group for group in range(len(original))
-                 if (rendered(group, 0) != rendered(group, 1)).any()]
+        *lit, dark = map(rendered, np.eye(len(original) + 1, len(original)))  # one white, none
+        shown = [i for i, image in enumerate(lit) if (image != dark).any()]
         for index in range(FRAMES):
             if index % DECISIONS == 0 or any(ends):
                 env.reset(seed=episode_seed(cfg.seed, EVALUATION, index))
             painter.paint(rng.uniform(np.min(boxes, 0)[0], np.max(boxes, 0)[1]))
             image, _, *ends, _ = env.step(rng.uniform(-1, 1, env.action_space.shape))
             images.append(image)
-            factors.append(np.concatenate([painter.current[shown].ravel(), data.qpos]))
-    names = [f"{painter.groups[group][0]} colour ({channel})" for group in shown
-             for channel in ("red", "green", "blue")]
+            factors.append([*painter.current[shown].flat, *data.qpos])
+    groups, rgb = [painter.groups[i][0] for i in shown], ("red", "green", "blue")
+    names = [f"{group} colour ({channel})" for group in groups for channel in rgb]
     names += [f"{joint.name} {i}".removesuffix(" 0")
               for joint in map(model.joint, range(model.njnt)) for i in range(len(joint.qpos0))]
-    factors = np.array(factors)
+    names, factors = np.array(names), np.array(factors)
     angles = 3 * len(shown) + model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
     factors[:, angles] = np.angle(np.exp(1j * factors[:, angles]))
     varies = np.ptp(factors, 0) > 0
-    return np.array(images), factors[:, varies], np.array(names)[varies].tolist()
+    return np.array(images), factors[:, varies], names[varies].tolist()
 
 def disentanglement(codes, factors):
     """DCI (Eastwood & Williams 2018) and MIG (Chen et al. 2018, 20 bins), 1 is best; codes (N, Z),
@@ -1642,27 +1640,26 @@ def disentanglement(codes, factors):
 
 @torch.no_grad()
 def measure(cfg, model, teacher, path):
-    """Is it disentangled? Score the latents' means: a teacher's, the model's at the start and end
-    of its training. Prints and writes JSON; returns what each latent at the end follows most."""
+    """Score encoders, print and write JSON. Returns what each latent of the model follows most."""
     images, factors, names = labelled_frames(cfg)
-    frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
     torch.manual_seed(cfg.seed)                                               # as training began
-    start = type(model)(cfg, model.rssm.action_dim).to(cfg.device)
-    encoders = dict(teacher=teacher, start=start.encoder, end=model.encoder)
-    for name, encoder in encoders.items() if teacher else [*encoders.items()][1:]:
+    start = type(model)(cfg, model.rssm.action_dim).to(cfg.device).encoder
+    encoders = (dict(teacher=teacher) if teacher else {}) | dict(start=start, end=model.encoder)
+    frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
+    for name, encoder in encoders.items():
         codes = torch.cat([encoder(preprocess(part.to(cfg.device)))[0].cpu() for part in frames])
         scores, share = disentanglement(codes.numpy(), factors)
         result[name] = scores | dict(share=share.tolist())
         print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")
     path.write_text(json.dumps(result, indent=2) + "\n")
-    return [f"{names[k]} {row[k]:.2f}" for row, k in zip(share.T, share.argmax(0), strict=True)]
+    return [f"{names[row.argmax()]} {row.max():.2f}" for row in share.T]
 
 def draw_grid(pictures, rows, columns, path, title=""):
     """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
     from matplotlib.figure import Figure  # slow to import
     r, c = pictures.shape[:2]
     axes = Figure(figsize=(c * 0.75 + 1, r * 0.75 + 0.5)).subplots()
-    axes.imshow(pictures.transpose(0, 2, 1, 3, 4).reshape(r * 64, c * 64, 3))
+    axes.imshow(pictures.swapaxes(1, 2).reshape(r * 64, c * 64, 3))
     axes.set(title=title, frame_on=False, yticks=np.arange(r) * 64 + 32, yticklabels=rows,
              xticks=np.arange(c) * 64 + 32, xticklabels=columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
@@ -1671,9 +1668,8 @@ def draw_grid(pictures, rows, columns, path, title=""):
 
 def traverse(cfg, folder, metrics=False):
     """Draw latent traversals and open-loop predictions of a run.
-    traversal.png (of β-VAE latents), open_loop.png; metrics: also disentanglement.json, and in the
-    picture what each latent follows. Episodes: an agent's own; a predictor's --videos, else its
-    own, else those collected beside it: none that a checkpoint, maybe a stranger's, could name."""
+    Episodes: an agent's own; a predictor's --videos, else its own, else those collected beside it:
+    none that a checkpoint, maybe a stranger's, could name."""
     videos, device = cfg.videos, torch.device(cfg.device)
     cfg, model, _ = load_model(folder / "checkpoint.pt", device)
     if isinstance(model, Agent):
@@ -1689,10 +1685,10 @@ def traverse(cfg, folder, metrics=False):
     if not replay.rows:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from (see --videos)")
     # From the middle of the last episode: the colours of the end, and a pose that is not the start.
-    start = ([0, *replay.ends][-2] + replay.rows) // 2
-    window = replay.window(start, min(50, replay.rows - start))
-    window["is_first"][0] = True
-    batch = to_device({key: value[None] for key, value in window.items()}, device)
+    rows = replay.read(replay.paths[-1])
+    rows = rows[len(rows) // 2:][:50]
+    batch = to_device({key: np.array(rows[key])[None] for key in replay.dtype.names}, device)
+    batch["is_first"][:, 0] = True
     torch.manual_seed(cfg.seed)
     strip = open_loop(model, batch)
     draw_grid(strip[:, ::4], ("truth", "model", "error"), range(0, strip.shape[1], 4),
@@ -1705,8 +1701,7 @@ def traverse(cfg, folder, metrics=False):
                   ["recon.", *TRAVERSAL], folder / "traversal.png")
 
 def read_log(folder):
-    """A run's metrics.jsonl → list of dicts; empty when there is none.
-    A last line without its end is left out: it is being written, or was cut off."""
+    """A run's metrics.jsonl → list of dicts. A line without its end, of a live run, is left out."""
     path = folder / "metrics.jsonl"
     with reading(path, "log of ours", "remove it"):
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
@@ -1719,9 +1714,9 @@ def read_log(folder):
 
 def curve_figures(runs, switch=None):
     """Interquartile means over seeds with bootstrap 95 % intervals, as rliable defines them.
-    runs: {env step: evaluation return} of each seed, of which the steps that all share count.
-    Returns [iqm, low, high], or [iqm] of one seed, of the curve, the mean of its last three points,
-    its area by its length in steps, and the points just before and after the env step `switch`."""
+    runs: {env step: evaluation return} of each seed; the steps that all share count. Returns
+    [iqm, low, high], or [iqm] of one seed, of the curve, the mean of its last three points, its
+    area by its length in steps, and the points just before and after the env step `switch`."""
     from scipy.stats import bootstrap, trim_mean  # slow to import
     steps = sorted(set.intersection(*map(set, runs)))
     if not steps:
@@ -1741,8 +1736,7 @@ def curve_figures(runs, switch=None):
 
 def plot(cfg, folders, path):
     """Draw learning curves of runs.
-    Evaluation returns of …/<tasks>/<method>/seed<k>: interquartile mean, 95 % interval. Prints
-    `curve_figures`, and writes these beside the picture as JSON."""
+    …/<tasks>/<method>/seed<k>; prints `curve_figures` and writes them beside the picture, JSON."""
     from matplotlib.figure import Figure  # slow to import
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
     for folder in folders or sorted(Path(cfg.runs).glob("finetune/*/*/seed*")):
@@ -1781,19 +1775,16 @@ def plot(cfg, folders, path):
 # === Doctor and bench =============================================================================
 
 def machine(cfg):
-    """What runs here, and on what."""
     versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
     return dict(device=cfg.device, precision=cfg.precision, threads=torch.get_num_threads(),
                 gl=os.environ["MUJOCO_GL"], versions=versions | dict(python=sys.version.split()[0]))
 
 def show(result):
-    """Print a dict of dicts, a line for each value."""
     for name, value in result.items():
         for part, number in value.items() if isinstance(value, dict) else [("", value)]:
             print(f"{f'{name} {part}':30}", f"{number:.4g}" if type(number) is float else number)
 
 def family_tasks(cfg):
-    """A task of each family."""
     dmc = cfg.dst if cfg.dst in TASKS else "walker_walk"
     return dmc, "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5"
 
@@ -1802,15 +1793,15 @@ def doctor(cfg):
     doctor.png: a frame of each family in each phase. Raises UserError, last, if one fails."""
     show(machine(cfg))
     tasks, failed, path = family_tasks(cfg), [], Path(cfg.runs) / "doctor.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
     pictures = np.full((len(tasks), len(PHASES), 64, 64, 3), 128, np.uint8)   # grey: has failed
     for row, task in zip(pictures, tasks, strict=True):
         try:
-            with contextlib.closing(config_env(cfg, task, "none")) as env:
+            with config_env(cfg, task, "none") as env:
                 row[:] = [env.reset(seed=cfg.seed, options=dict(phase=p))[0] for p in PHASES]
         except UserError as error:
             print(f"{task}: {error}")
             failed.append(task)
-    path.parent.mkdir(parents=True, exist_ok=True)
     draw_grid(pictures, tasks, PHASES, path)
     if failed:
         raise UserError(f"{', '.join(failed)} cannot be rendered; the causes stand above")
@@ -1821,40 +1812,39 @@ def median_s(function, repeats):
 
 def bench(cfg, as_json=False, scaling=False, repeats=5):
     """Time the steps, count the parameters.
-    An update, a pretraining update, drawing a batch; in each family of tasks a frame, a decision.
-    scaling: also the update at four batch sizes and horizons, and the exponent of its growth."""
+    scaling: also an update at four batch sizes and horizons, and the exponent of its growth."""
     memory_needed(cfg)                                                        # or an error
     device, rng, result = torch.device(cfg.device), np.random.default_rng(0), machine(cfg)
     result |= {name: getattr(cfg, name) for name in ("method", "batch_size", "batch_length")}
     teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
-    def update_s(cfg, learner, *args):
-        data = replay.sample(cfg.batch_size, cfg.batch_length, rng)
+    with config_env(cfg, cfg.dst, "none", pixels=False) as env:
+        more = *env.action_space.shape, device, teacher
+    agent = Agent(cfg, *more)
+    def update_s(learner, *args):
+        data = replay.sample(learner.cfg.batch_size, learner.cfg.batch_length, rng)
         return median_s(lambda: mean_metrics([learner.update(data, *args)]), max(1, repeats))
-    with contextlib.closing(config_env(cfg, cfg.dst, "none", pixels=False)) as env:
-        actions = env.action_space.shape[0]
     with tempfile.TemporaryDirectory() as folder:
-        replay = Replay(folder, row_type(actions, cfg.z_dim if teacher else 0))
-        agent = Agent(cfg, actions, device, teacher)
+        replay = Replay(folder, row_type(agent.action_dim, cfg.z_dim if teacher else 0))
         noise = rng.integers(0, 256, (max(1000, cfg.batch_length), 64, 64, 3), np.uint8)
-        rows = [make_row(image, rng.uniform(-1, 1, actions)) for image in noise]
+        rows = [make_row(image, rng.uniform(-1, 1, agent.action_dim)) for image in noise]
         replay.add(rows, **agent.taught(rows))
-        result["train_step_s"] = update_s(cfg, agent, cfg.eta, 1)
-        result["sample_ms"] = 1e3 * median_s(
-            lambda: replay.sample(cfg.batch_size, cfg.batch_length, rng), 20)
-        result["pretrain_step_s"] = update_s(cfg, VideoTrainer(cfg, None, device))
+        result["train_step_s"] = update_s(agent, cfg.eta, 1)
+        draw = functools.partial(replay.sample, cfg.batch_size, cfg.batch_length, rng)
+        result["sample_ms"] = 1e3 * median_s(draw, 20)
+        result["pretrain_step_s"] = update_s(VideoTrainer(cfg, None, device))
         result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         for name in ("batch_size", "horizon") if scaling else ():
             sizes = [math.ceil(getattr(cfg, name) * part / 4) for part in (1, 2, 3, 4)]
-            cfgs = [replace(cfg, **{name: size}) for size in sizes]
-            times = [update_s(c, Agent(c, actions, device, teacher), c.eta, 1) for c in cfgs]
+            agents = [Agent(replace(cfg, **{name: size}), *more) for size in sizes]
+            times = [update_s(each, cfg.eta, 1) for each in agents]
             growth = dict(exponent=float(np.polyfit(np.log(sizes), np.log(times), 1)[0]))
             result[f"{name}_scaling"] = dict(zip(map(str, sizes), times, strict=True)) | growth
     parts = dict(agent.behaviour.named_children(), world_model=agent.model, teacher=teacher)
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
     result |= dict(params=counts | dict(total=sum(counts.values())), frame_ms={}, decision_ms={})
     for task in family_tasks(cfg):
-        with contextlib.closing(config_env(cfg, task, "train")) as env:
-            agent = Agent(cfg, env.action_space.shape[0], device, teacher)
+        with config_env(cfg, task, "train") as env:
+            agent = Agent(cfg, *env.action_space.shape, device, teacher)
             seen = env.render()[None], np.zeros((1, agent.action_dim), np.float32), None
             result["frame_ms"][task] = 1e3 * median_s(env.render, 50)
             result["decision_ms"][task] = 1e3 * median_s(
@@ -1863,28 +1853,24 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
 
 # === Command line =================================================================================
 
+FRESH = {"--fresh": dict(action="store_true", help="start over instead of resuming")}
+RUN = {"--run": dict(type=Path, required=True, help="folder of a run: runs/…/seed0")}
 COMMANDS = dict(  # and the flags that their functions take after cfg, in that order
-    collect=["--fresh"], pretrain=["--fresh"], finetune=["--fresh"], evaluate=["--run"],
-    traverse=["--run", "--metrics"], plot=["run", "--out"], doctor=[],
-    bench=["--json", "--scaling", "--repeats"])
-FLAGS = {  # beside those of Config
-    "--preset": dict(choices=PRESETS, help="default: paper on CUDA, else small"),
-    "--fresh": dict(action="store_true", help="start over instead of resuming"),
-    "--run": dict(type=Path, required=True, help="folder of a run: runs/…/seed0"),
-    "--metrics": dict(action="store_true", help="also measure disentanglement"),
-    "run": dict(type=Path, nargs="*", help="folders of runs; default: all finetune runs"),
-    "--out": dict(type=Path, help="PNG to write; default: curves.png in --runs"),
-    "--json": dict(action="store_true", help="print one JSON object"),
-    "--scaling": dict(action="store_true", help="how an update's cost grows"),
-    "--repeats": dict(type=int, default=5, help="updates to take the median of")}
+    collect=FRESH, pretrain=FRESH, finetune=FRESH, evaluate=RUN,
+    traverse=RUN | {"--metrics": dict(action="store_true", help="also measure disentanglement")},
+    plot={"run": dict(type=Path, nargs="*", help="folders of runs; default: all finetune runs"),
+          "--out": dict(type=Path, help="PNG to write; default: curves.png in --runs")},
+    doctor={},
+    bench={"--json": dict(action="store_true", help="print one JSON object"),
+           "--scaling": dict(action="store_true", help="how an update's cost grows"),
+           "--repeats": dict(type=int, default=5, help="updates to take the median of")})
 
 class Parser(argparse.ArgumentParser):
     """argparse whose errors are one line; that of an unknown flag lists what exists."""
-
     def error(self, message):
         flags = " ".join(a.option_strings[0] for a in self._actions[1:] if a.option_strings)
         hint = f"there are: {flags}" if "unrecognized" in message else f"see: {self.prog} --help"
-        self.exit(2, " ".join(f"error: {message}; {hint}".split()) + "\n")
+        raise UserError(f"{message}; {hint}", code=2)
 
 def parse_args(argv):
     """The command line → (function, Config, more arguments). Config: preset, then method, flags."""
@@ -1893,8 +1879,9 @@ def parse_args(argv):
     for name, own in COMMANDS.items():
         help = (globals()[name].__doc__ or name).split("\n")[0]              # -OO has none
         sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
-        for flag in dict.fromkeys(["--preset", "--fresh", *own]):             # each once
-            sub.add_argument(flag, **FLAGS[flag])
+        sub.add_argument("--preset", choices=PRESETS, help="default: paper on CUDA, else small")
+        for flag, options in (FRESH | own).items():
+            sub.add_argument(flag, **options)
         for field in dataclasses.fields(Config):
             meta, kind = field.metadata, type(field.default)
             choices = METHODS if field.name == "method" else meta["choices"]
@@ -1904,30 +1891,27 @@ def parse_args(argv):
                              default=argparse.SUPPRESS, **options,
                              help=f"{meta['help']}; paper preset: {field.default or 'none'}")
     args, unknown = parser.parse_known_args(argv)
-    args, refuse = vars(args), commands.choices[args.command].error
+    args, sub, own = vars(args), commands.choices[args.command], COMMANDS[args.command]
     if unknown:
-        refuse(f"unrecognized arguments: {' '.join(unknown)}")
+        sub.error(f"unrecognized arguments: {' '.join(unknown)}")
     given = {key: value for key, value in args.items() if key in Config.__dataclass_fields__}
     preset = args["preset"] or ("paper" if torch.cuda.is_available() else "small")
     try:
         cfg = replace(PRESETS[preset], **METHODS[given.get("method", "diswm")] | given)
     except ValueError as error:
-        refuse(str(error))
-    own = COMMANDS[args["command"]]
+        sub.error(str(error))
     if not args["preset"] and "--fresh" in own:
         print(f"preset {preset}; --preset chooses another: {', '.join(PRESETS)}")
-    for task in (cfg.src, cfg.dst):
-        check_task(task)
+    check_task(cfg.src)
+    check_task(cfg.dst)
     return globals()[args["command"]], cfg, [args[flag.strip("-")] for flag in own]
 
 def prepare_machine(cfg):
     """Decide what is "auto", and set torch up. Returns the Config with the decisions."""
-    gpu = torch.cuda.is_available()
-    device = cfg.device.replace("auto", "cuda" if gpu else "cpu")
-    if device == "cuda" and not gpu:
+    device = cfg.device.replace("auto", "cuda" if torch.cuda.is_available() else "cpu")
+    if device == "cuda" and not torch.cuda.is_available():
         raise UserError("there is no CUDA device; use --device cpu")
-    cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
-    native = device == "cuda" or "avx512_bf16" in cpuinfo or "amx_bf16" in cpuinfo
+    native = device == "cuda" or torch.cpu.get_capabilities().get("avx512_bf16")
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     torch.set_num_threads(cfg.threads or os.cpu_count())
     if platform.libc_ver()[0] == "glibc":
