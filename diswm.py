@@ -168,6 +168,7 @@ class Config:
                           ("auto", "fp32", "bf16"), free=True)
     threads: int = flag(0, "CPU threads; 0: one per core (ours)", high=1024, free=True)
     compile: bool = flag(False, "torch.compile model and imagination, for GPUs (ours)", free=True)
+
     def __post_init__(self):
         """Raises ValueError at wrong types and values out of range, also those of a checkpoint."""
         for field in dataclasses.fields(self):
@@ -296,6 +297,7 @@ class MLP(nn.Sequential):
         hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
         super().__init__(*hidden, nn.Linear(units, 2 * dims if dims else 1))
         self.dims = dims
+
     def forward(self, x):
         x = super().forward(x).float()
         if not self.dims:
@@ -323,8 +325,10 @@ class PerFrame(nn.Module):
     def __init__(self, dims, *layers):
         super().__init__()
         self.dims, self.net = dims, nn.Sequential(*layers)
+
     def forward(self, x):
         return self.net(x.flatten(0, -1 - self.dims)).float().unflatten(0, x.shape[:-self.dims])
+
     def encode(self, image):
         """→ dict of `embed`; a β-VAE's is a latent_code"""
         return dict(embed=self(image))
@@ -336,8 +340,10 @@ class BetaVAEEncoder(PerFrame):
         super().__init__(3, *stack(nn.Conv2d, [3, d, d, 2 * d, 2 * d, 8 * d], shapes),
                          nn.Flatten(), nn.Linear(8 * d, 2 * z_dim))
         self.apply(kaiming)
+
     def forward(self, image):
         return super().forward(image).chunk(2, -1)
+
     def encode(self, image):
         return latent_code(*self(image))
 
@@ -383,13 +389,16 @@ class RSSM(nn.Module):
         self.norm = nn.LayerNorm(3 * deter)
         self.prior_net = MLP(deter, hidden, 1, stoch)
         self.post_net = MLP(deter + embed_dim, hidden, 1, stoch)
+
     @staticmethod
     def feat(state):
         """What decoder, heads, actor and critic see: [z_t, h_t], (..., S + D)"""
         return torch.cat([state["stoch"], state["deter"]], -1)
+
     def initial(self, batch):
         """The zero state for a batch."""
         return {key: self.norm.weight.new_zeros(batch, size) for key, size in self.sizes.items()}
+
     def recur(self, state, action):
         """h_t = f(h_{t−1}, z_{t−1}, a_{t−1}): GRU, layer norm. Zeros pad an action too short."""
         x = torch.cat([state["stoch"], action], -1) if self.action_dim else state["stoch"]
@@ -398,21 +407,26 @@ class RSSM(nn.Module):
         reset, candidate, update = gates.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         return torch.lerp(state["deter"], candidate, torch.sigmoid(update - 1))         # (B, D)
+
     def draw(self, net, inputs, deter):
         """A state around h_t: `net`'s distribution, a sample."""
         mean, std = net(inputs)
         return dict(deter=deter, mean=mean, std=std, stoch=gaussian_sample(mean, std))
+
     def prior(self, deter):
         """ẑ_t ~ p(ẑ_t | h_t)"""
         return self.draw(self.prior_net, deter, deter)
+
     def posterior(self, deter, embed):
         """z_t ~ q(z_t | h_t, embed_t)"""
         return self.draw(self.post_net, torch.cat([deter, embed], -1), deter)
+
     def step(self, state, action, embed, is_first):
         """One filtering step; where is_first (B,) is set, state and action are forgotten."""
         keep = 1 - is_first.to(embed.dtype)[:, None]
         state = {key: value * keep for key, value in state.items()}
         return self.posterior(self.recur(state, action * keep if self.action_dim else None), embed)
+
     def observe(self, embed, action, is_first):
         """Filter windows: (B, T, Z), (B, T, A), (B, T) → post, prior, dicts of (B, T, ·)."""
         state, states = self.initial(len(embed)), []
@@ -429,6 +443,7 @@ class StackedRSSM(RSSM):
         super().__init__(action_dim, embed_dim + stoch + deter, stoch, deter, hidden)
         self.below = RSSM(0, embed_dim, stoch, deter, hidden)
         self.sizes["below"] = stoch + deter
+
     def step(self, state, action, embed, is_first):
         stoch, deter = state["below"].split([self.sizes["stoch"], self.sizes["deter"]], -1)
         below = self.feat(self.below.step(dict(stoch=stoch, deter=deter), None, embed, is_first))
@@ -444,6 +459,7 @@ class IntrinsicBonus(nn.Module):
         self.register_buffer("queue", torch.zeros(size, dims))                # newest first
         self.register_buffer("filled", torch.tensor(0))
         self.register_buffer("scale", torch.ones(()))                         # running mean of |x|
+
     @torch.no_grad()
     def forward(self, feat):
         """feat (B, T, S + D) → (B, T − window + 1): row t is of rows t … t + window − 1."""
@@ -470,17 +486,20 @@ class VideoPredictor(nn.Module):
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
         self.rssm = rssm(action_dim, cfg.z_dim if vae else 32 * d, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
+
     def forward(self, batch):
         """Filter → dict of code (of encode), post, prior, feat."""
         code = self.encoder.encode(batch["image"])
         post, prior = self.rssm.observe(code["embed"], batch.get("action"), batch["is_first"])
         return dict(code=code, post=post, prior=prior, feat=self.rssm.feat(post))
+
     def terms(self, out, batch):
         """Loss terms of each step, (B, T), nats, but for the KL."""
         # −ln p(o_t | z_t), summed over pixels. The target stays fp32: bf16 would shift the loss.
         image, code = squared_error(batch["image"], self.decoder(out["feat"]), 3), out["code"]
         vae = dict(disentangle=beta_vae_kl(code["mean"], code["logvar"])) if "mean" in code else {}
         return dict(image=image) | vae
+
     def loss(self, out, batch, teacher=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, for the output of forward. Returns (loss, metrics).
         teacher: latent_code of the same images from the frozen teacher, or None."""
@@ -508,6 +527,7 @@ class WorldModel(VideoPredictor):
         self.reward = MLP(cfg.stoch + cfg.deter, cfg.units, 2)        # r̂, mean of a unit Gaussian
         self.discount = MLP(cfg.stoch + cfg.deter, cfg.units, 3)                  # the logit of γ̂
         self.bonus = IntrinsicBonus(cfg.stoch + cfg.deter) if cfg.bonus else None
+
     @torch.no_grad()
     def carry_over(self, video):
         """Take over a VideoPredictor's encoder, decoder and RSSM (in a stack, as the one below).
@@ -515,6 +535,7 @@ class WorldModel(VideoPredictor):
         own = nn.ModuleList([self.encoder, self.decoder, getattr(self.rssm, "below", self.rssm)])
         for weight, value in zip(own.parameters(), video.parameters(), strict=True):
             weight[..., :value.shape[-1]] = value
+
     def terms(self, out, batch):
         """Those of Eq. (2), the reward's and the discount's, (B, T) each."""
         feat = out["feat"][:, :batch["reward"].shape[1]]  # the last rows have no intrinsic bonus
@@ -535,13 +556,16 @@ class ActorCritic(nn.Module):
         self.critic = MLP(feat_dim, cfg.units, 3)
         self.slow_critic = MLP(feat_dim, cfg.units, 3).requires_grad_(False)      # only copied
         self.copy_critic()
+
     def copy_critic(self):
         """Slow critic ← critic."""
         self.slow_critic.load_state_dict(self.critic.state_dict())
+
     def policy(self, feat):
         """→ mean in (−1, 1) and std of the normal of actions, (..., A)"""
         mean, std = self.actor(feat)
         return torch.tanh(mean), std
+
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
               t        0     1    …   H−1      H
@@ -562,6 +586,7 @@ class ActorCritic(nn.Module):
             state = model.rssm.prior(model.rssm.recur(state, clip_action(raw)))
             feats.append(model.rssm.feat(state))
         return torch.stack(feats), torch.stack(log_probs), torch.stack(entropies)
+
     def losses(self, model, start, start_discount):
         """start: dict of (N, ·) detached states; start_discount (N,): their true γ_0.
         Returns (actor_loss, critic_loss, metrics). The actor's graph runs through the world model,
@@ -596,6 +621,7 @@ class Adam(torch.optim.Adam):
     """The optimiser of a module's parameters (published)."""
     def __init__(self, module, lr):
         super().__init__(module.parameters(), lr=lr, eps=1e-5)
+
     def load_state_dict(self, state):
         """The moments; the rest is the Config's. Torch itself would take another model's."""
         super().load_state_dict(dict(state, param_groups=self.state_dict()["param_groups"]))
@@ -645,6 +671,7 @@ class Agent:
         if cfg.compile:
             self.model.compile()
             self.behaviour.imagine = torch.compile(self.behaviour.imagine)
+
     @torch.no_grad()
     def act(self, image, action, state, explore):
         """Decide. image: uint8 (N, 64, 64, 3); action: the previous one, (N, A); state: None first.
@@ -656,6 +683,7 @@ class Agent:
         state = self.model.rssm.step(state, action, embed, is_first)
         mean, std = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
+
     @torch.no_grad()
     def taught(self, rows):
         """What the frozen teacher makes of an episode's images: {TEACHER: (T, Z)}, or {}."""
@@ -664,6 +692,7 @@ class Agent:
         image = torch.from_numpy(np.stack([row["image"] for row in rows])).to(self.device)
         code = self.teacher(preprocess(image))
         return {key: x.cpu().numpy() for key, x in zip(TEACHER, code, strict=True)}
+
     def update(self, batch, eta, update, probe=False):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
         update: index of this step. probe: measure distillation's own gradient at the encoder."""
@@ -695,9 +724,11 @@ class Agent:
         for name, loss in zip(("actor", "critic"), losses, strict=True):
             metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, clip)
         return {key: value.detach() for key, value in metrics.items()}
+
     def state_dict(self):
         return dict(model=self.model.state_dict(), behaviour=self.behaviour.state_dict(),
                     optimizers={name: opt.state_dict() for name, opt in self.optimizers.items()})
+
     def load_state_dict(self, state):
         self.model.load_state_dict(state["model"])
         self.behaviour.load_state_dict(state["behaviour"])
@@ -769,11 +800,13 @@ class Replay:
         self._hold([(path, len(self.read(path))) for path in sorted(self.folder.glob("*.npy"))])
         last = self.paths[-1].stem if self.paths else ""
         self.next_index = int(last) + 1 if last.isdecimal() else 0
+
     def _hold(self, episodes):
         """Index (path, length) pairs."""
         self.episodes, self.paths = episodes, [path for path, _ in episodes]
         self.ends = np.cumsum([length for _, length in episodes], dtype=int).tolist()
         self.rows = self.ends[-1] if episodes else 0
+
     def read(self, path):
         """An episode's rows, mapped, not read. UserError unless it has the fields of `dtype`."""
         with reading(path, f"episode with {', '.join(self.dtype.names)}", "remove it"):
@@ -784,6 +817,7 @@ class Replay:
                 if rows.dtype[name] != self.dtype[name]:
                     raise ValueError(f"{name} is {rows.dtype[name]}, not {self.dtype[name]}")
         return rows
+
     def add(self, rows, **more):
         """Append a finished episode, a list of `make_row`; the oldest beyond capacity go.
         more: fields that these do not have, arrays (T, ...)."""
@@ -797,13 +831,16 @@ class Replay:
         while self.capacity and self.rows - self.ends[0] >= self.capacity:
             self._hold(self.episodes[1:])
         self.next_index += 1
+
     def prune(self):
         """Delete files not in the index, once no checkpoint needs them."""
         for path in set(self.folder.glob("*.npy")) - set(self.paths):
             path.unlink()
+
     def state_dict(self):
         """Which episodes there are: the first one and the next to come."""
         return dict(first=self.next_index - len(self.paths), next=self.next_index)
+
     def load_state_dict(self, state):
         """Return to those episodes; later ones, of a run cut off, go."""
         numbers, self.next_index = range(state["first"], state["next"]), state["next"]
@@ -812,6 +849,7 @@ class Replay:
         if len(self.paths) != len(numbers):
             raise UserError(f"{self.folder} lacks episodes of its checkpoint; start over: --fresh")
         self.prune()
+
     def window(self, start, length):
         """Rows start … start + length − 1: dict of (T, ...)"""
         pieces = []
@@ -821,6 +859,7 @@ class Replay:
             pieces.append(rows)
             start, length = start + len(rows), length - len(rows)
         return {key: np.concatenate([rows[key] for rows in pieces]) for key in self.dtype.names}
+
     def sample(self, batch_size, length, rng):
         """Dict of (B, T, ...); windows begin is_first."""
         starts = rng.integers(0, self.rows - length + 1, batch_size)
@@ -830,14 +869,15 @@ class Replay:
         return batch
 
 def open_videos(folder, cache):
-    """The episodes of a folder, *.npy of ours or anybody's *.npz, as a Replay of images.
-    An .npz, the authors' are compressed, is unpacked into `cache`, once; not a zip bomb."""
+    """The episodes of a folder, *.npy of ours or anybody's *.npz, as a Replay of images. An .npz,
+    the authors' are compressed, is unpacked into a folder of `cache`, once; not a zip bomb."""
     paths = sorted(Path(folder).glob("*.np[yz]"))
     if not paths:
         raise UserError(f"no episodes (*.npy, *.npz) in {folder}; run: python diswm.py collect "
                         "--src TASK")
     if all(path.suffix == ".npy" for path in paths):
         return Replay(folder)
+    cache = cache / re.sub(r"\W", "_", str(Path(folder).resolve()))           # one for each folder
     cache.mkdir(parents=True, exist_ok=True)
     for path in paths:
         unpacked = cache / f"{path.name}.npy"
@@ -893,11 +933,13 @@ class DMControlEnv(gym.Env):
         self.action_space = gym.spaces.Box(np.float32(spec.minimum), np.float32(spec.maximum))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, size, np.float64)
         self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr
+
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         if seed is not None:
             self.env.task.random.seed(seed)
         return self.env.reset().observation["observations"], {}
+
     def step(self, action):
         step = self.env.step(action)
         obs, terminated = step.observation["observations"], step.discount == 0  # 1 at a time limit
@@ -919,6 +961,7 @@ def drawer_world(task):
                 material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = phase
             model = spec.compile()
             return model, mujoco.MjData(model)
+
         def reset(self, *, seed=None, options=None):
             if seed is not None:
                 self.seed(seed)                                               # reset ignores it
@@ -953,6 +996,7 @@ class ActionRepeat(gym.Wrapper):
     def __init__(self, env, n):
         super().__init__(env)
         self.n = n
+
     def step(self, action):
         # DEVIATION: the published code repeats in two wrappers (really 4) and doubles rewards.
         total, steps, terminated, truncated, reached = 0.0, 0, False, False, []
@@ -1002,10 +1046,12 @@ class ColorDistractor(gym.Wrapper):
         original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
         tint = np.arange(len(original))[:, None] >= (task == "pusher")        # black: its object
         self.boxes = {p: tint * color_box(p, original, colors, half_range) for p in PHASES}
+
     def paint(self, colors):
         self.current = colors
         for (_, array, rows), color in zip(self.groups, colors, strict=True):
             array[rows, :3] = color
+
     def reset(self, *, seed=None, options=None):
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])
@@ -1014,6 +1060,7 @@ class ColorDistractor(gym.Wrapper):
         colors = self.rng.uniform(*self.boxes[self.phase])
         self.paint(self.original if self.phase == "none" else colors)
         return self.env.reset(seed=seed, options=options)
+
     def step(self, action):
         if self.step_std and self.phase != "none":
             walk = self.rng.normal(np.float32(self.current), self.step_std)   # as MuJoCo rounds
@@ -1024,6 +1071,7 @@ class Pixels(gym.ObservationWrapper):
     """Observe what a camera sees, uint8 (size, size, 3). By mujoco.Renderer, since the simulators'
     render() keeps whichever GL context was last: two in a process show each other's textures."""
     metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
+
     def __init__(self, env, size=64, fast=False):
         super().__init__(env)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
@@ -1042,12 +1090,14 @@ class Pixels(gym.ObservationWrapper):
         # A mirroring floor costs 12 % of a frame (17 ms in DrawerWorld), and shows < 0.6 / 255.
         self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         atexit.register(self.renderer.close)  # one that is open at exit prints GL errors
+
     def reset(self, *, seed=None, options=None):
         _, info = self.env.reset(seed=seed, options=options)
         for index in range(self.unwrapped.model.nhfield):                     # quadruped's terrain
             self.renderer._gl_context.make_current()
             mujoco.mjr_uploadHField(self.unwrapped.model, self.renderer._mjr_context, index)
         return self.render(), info
+
     def observation(self, observation=None):
         data = self.unwrapped.data
         if hasattr(self.unwrapped, "_render_callback"):                       # puts Fetch's goal
@@ -1056,7 +1106,9 @@ class Pixels(gym.ObservationWrapper):
             data.qacc_warmstart[:] = warmstart  # else looking would change, in bits, what happens
         self.renderer.update_scene(data, camera=self.camera)
         return self.renderer.render()
+
     render = observation
+
     def close(self):
         atexit.unregister(self.renderer.close)
         self.renderer.close()
@@ -1194,6 +1246,7 @@ class Run:
         if differ:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
+
     def save(self, trainer):
         """Write the checkpoint, whole or not at all."""
         cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
@@ -1205,6 +1258,7 @@ class Run:
             file.write(json.dumps(vars(self.cfg), indent=2).encode())
         with atomic(self.checkpoint) as file:
             file.write(buffer.getbuffer())
+
     def restore(self, trainer):
         """Trainer, random numbers, and the log as it was then."""
         with reading(self.checkpoint):
@@ -1288,6 +1342,7 @@ class Trainer:
     def state_dict(self):
         parts = {name: getattr(self, name).state_dict() for name in self.parts}
         return parts | {name: getattr(self, name) for name in self.counters}
+
     def load_state_dict(self, state):
         for name in self.parts:
             getattr(self, name).load_state_dict(state[name])
@@ -1300,6 +1355,7 @@ class VideoTrainer(Trainer):
     """Stage 2, Algorithm 1 lines 4–8: the video predictor. Progress is in updates."""
     unit, shown, parts = "updates", ("image", "kl", "disentangle"), ("model", "optimizer")
     counters, chunk = ("progress", "metrics"), 100                            # updates per log row
+
     def __init__(self, cfg, videos, device):
         self.cfg, self.videos, self.device = cfg, videos, device
         self.model = VideoPredictor(cfg).to(device)
@@ -1307,6 +1363,7 @@ class VideoTrainer(Trainer):
             self.model.compile()
         self.optimizer = Adam(self.model, cfg.model_lr)
         self.progress, self.metrics, self.total = 0, [], cfg.pretrain_updates
+
     def update(self, batch):
         """One step of Eq. (2) on numpy arrays (B, T, ...) → metrics."""
         batch = to_device(batch, self.device)
@@ -1314,6 +1371,7 @@ class VideoTrainer(Trainer):
             loss, metrics = self.model.loss(self.model(batch), batch)
         norm = gradient_step(self.optimizer, loss, self.cfg.grad_clip)
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
+
     def advance(self):
         """An update → after every `chunk` of them, and at the end, a row of the log."""
         cfg, rng = self.cfg, np.random.default_rng([self.cfg.seed, self.progress])  # not saved
@@ -1331,6 +1389,7 @@ class AgentTrainer(Trainer):
     recurrent state is in it; the colours, η and all seeds follow from the counters."""
     unit, shown = "env steps", ("train_return", "eval_return", "image", "reward", "kl", "eta")
     parts, counters = ("agent", "replay"), ("progress", "decisions", "updates", "episodes")
+
     def __init__(self, cfg, folder, device, teacher=None):
         self.cfg = cfg
         self.envs = config_envs(cfg, cfg.dst)
@@ -1339,6 +1398,7 @@ class AgentTrainer(Trainer):
         self.replay = Replay(folder / "episodes", rows, cfg.replay_capacity)
         self.progress = self.decisions = self.updates = self.episodes = 0
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
+
     def learn(self, env_steps):
         """The updates due after a decision in each environment that plays → list of metrics."""
         cfg, before, metrics = self.cfg, self.decisions, []
@@ -1357,6 +1417,7 @@ class AgentTrainer(Trainer):
             metrics.append(check_finite(update))
             self.updates += 1
         return metrics
+
     def play(self):
         """An episode in each environment, learning on the way → see play_episodes, and the metrics
         of the updates. It ends with the simulator's, at the colour switch, or with the run."""
@@ -1372,6 +1433,7 @@ class AgentTrainer(Trainer):
             metrics.extend(self.learn(env_steps))
             return self.progress >= limit
         return play_episodes(self.envs, policy, seeds, self.phase, each), metrics
+
     def advance(self):
         """An episode in each environment, and an evaluation when one is due → a row of the log."""
         cfg, start = self.cfg, self.progress
@@ -1390,6 +1452,7 @@ class AgentTrainer(Trainer):
             row["eval_return"] = result.pop("mean")
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
+
     def state_dict(self):
         """And the teacher, so that the run needs no other file."""
         net = self.agent.teacher
@@ -1594,12 +1657,11 @@ def labelled_frames(cfg):
     images, factors, ends, rng = [], [], [], np.random.default_rng(cfg.seed)
     with config_env(cfg, cfg.dst, "none") as env:
         model, data, painter = env.unwrapped.model, env.unwrapped.data, env.env
-        original = np.array([rgb[0] for rgb in painter.original]).reshape(-1, 3)
-        boxes = [color_box(phase, original, cfg.colors, cfg.color_range) for phase in PHASES[:2]]
+        boxes, count = [painter.boxes[phase] for phase in PHASES[:2]], len(painter.groups)
         def rendered(colors):
             painter.paint(colors)
             return env.render()
-        *lit, dark = map(rendered, np.eye(len(original) + 1, len(original)))  # one white, none
+        *lit, dark = map(rendered, np.eye(count + 1, count))                  # one white, none
         shown = [i for i, image in enumerate(lit) if (image != dark).any()]
         for index in range(FRAMES):
             if index % DECISIONS == 0 or any(ends):
@@ -1677,10 +1739,12 @@ def traverse(cfg, folder, metrics=False):
         teacher, model = model.teacher, model.model
     else:
         source = folder.resolve().parent.parent.name
-        places = [folder / "videos", *folder.glob(f"../../../../collect/{source}/*/seed*/episodes")]
-        replay = Replay(videos or next(filter(Path.exists, places), places[0]))
+        places = [*(folder / "videos").glob("*"),
+                  *folder.glob(f"../../../../collect/{source}/*/seed*/episodes"), folder]
+        replay = open_videos(videos, folder / "videos") if videos else Replay(places[0])
         teacher, cfg = None, replace(cfg, dst=cfg.src)                        # also of old runs
-    if metrics and cfg.encoder != "beta_vae":
+    stacked = isinstance(model.rssm, StackedRSSM)
+    if metrics and (cfg.encoder != "beta_vae" or stacked):
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from (see --videos)")
@@ -1693,7 +1757,7 @@ def traverse(cfg, folder, metrics=False):
     strip = open_loop(model, batch)
     draw_grid(strip[:, ::4], ("truth", "model", "error"), range(0, strip.shape[1], 4),
               folder / "open_loop.png", "open-loop prediction: frames 5 … are predicted, not seen")
-    if cfg.encoder == "beta_vae" and not isinstance(model.rssm, StackedRSSM):
+    if cfg.encoder == "beta_vae" and not stacked:
         pictures, nats = latent_traversal(model, batch)
         order, path = np.argsort(-nats), folder / "disentanglement.json"      # informative first
         follows = measure(cfg, model, teacher, path) if metrics else [""] * len(nats)
@@ -1707,8 +1771,9 @@ def read_log(folder):
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
         rows = [json.loads(line) for line in lines]
         for row in rows:
-            step = row["step" if type(row.get("phase")) is str else "update"]
-            if not math.isfinite(step + row.get("eval_return", 0)):
+            step = row["step" if "phase" in row else "update"]                # an agent's or not
+            known = type(row.get("phase", "")) is str
+            if not (known and math.isfinite(step + row.get("eval_return", 0))):
                 raise ValueError(f"step {step}")
     return rows
 
@@ -1740,7 +1805,7 @@ def plot(cfg, folders, path):
     from matplotlib.figure import Figure  # slow to import
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
     for folder in folders or sorted(Path(cfg.runs).glob("finetune/*/*/seed*")):
-        rows = read_log(folder)
+        rows = [row for row in read_log(folder) if "phase" in row]
         if curve := {row["step"]: row["eval_return"] for row in rows if "eval_return" in row}:
             tasks, method, _ = folder.resolve().parts[-3:]
             curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
@@ -1914,6 +1979,11 @@ def prepare_machine(cfg):
     native = device == "cuda" or torch.cpu.get_capabilities().get("avx512_bf16")
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     torch.set_num_threads(cfg.threads or os.cpu_count())
+    if device == "cpu":  # what is too large fails as an error, and is not killed
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        limit = memory if soft == resource.RLIM_INFINITY else min(soft, memory)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
     if platform.libc_ver()[0] == "glibc":
         # Large buffers go back to the kernel each step otherwise: 1.9× of a step at 50 × 50.
         for threshold, value in ((-3, 1 << 30), (-1, (1 << 31) - 1)):         # mmap's, trim's
@@ -1932,7 +2002,8 @@ def main(argv=None):
         message, code = (f"{error.filename or 'output'}: {error.strerror or error}; mend that and "
                          "run the same command again, the last checkpoint is whole"), 1
     except (MemoryError, RuntimeError) as error:
-        if not re.search("(?i)alloc|memory|overflow", repr(error)):
+        causes = repr((error, error.__context__))  # torch.save hides a MemoryError behind its own
+        if not re.search("(?i)alloc|memory|overflow", causes):
             raise
         message, code = f"too large for the memory: {error}"[:200], 1
     except KeyboardInterrupt:
