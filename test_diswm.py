@@ -35,7 +35,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -1656,10 +1656,13 @@ def test_planted_action_repeat_bug_is_noticed(bug, monkeypatch):
         check_action_repeat_sums_rewards()
 
 
-@pytest.mark.parametrize("limit", [7, 8])
-def test_time_limit_counts_env_steps_and_is_no_terminal(limit):
-    """Time limits truncate; a repeat that they cut short counts the steps that were made."""
-    with closing_env("walker_walk", pixels=False, time_limit=limit) as env:
+@pytest.mark.parametrize("task, given, limit", [
+    ("walker_walk", 7, 7), ("walker_walk", 8, 8), ("walker_walk", 0, 1000), ("pusher", 0, 100),
+    ("drawer_open", 0, 200), ("FetchReach-v4", 0, 50), ("HalfCheetah-v5", 0, 1000)])
+def test_time_limit_counts_env_steps_and_is_no_terminal(task, given, limit):
+    """Time limits, by default the task's own, truncate; a repeat that they cut short counts the
+    steps that were made."""
+    with closing_env(task, pixels=False, time_limit=given) as env:
         env.reset(seed=0)
         steps, done = 0, False
         while not done:
@@ -3536,6 +3539,8 @@ LOG_ROWS = st.dictionaries(st.sampled_from(["step", "update", "eval_return", "ph
 
 @settings(max_examples=60)
 @given(rows=st.lists(LOG_ROWS, max_size=4), garbage=st.binary(max_size=20) | st.just(b""))
+@example(rows=[{"update": 1, "eval_return": 2.0}], garbage=b"")  # no phase
+@example(rows=[{"step": 10, "phase": "a", "eval_return": 1.5}, {"update": 3}], garbage=b"")
 def test_any_log_is_drawn_or_one_line(rows, garbage):
     """plot reads metrics.jsonl files of others: rows that are no objects, lack their step, …"""
     with tempfile.TemporaryDirectory() as runs:
