@@ -787,6 +787,14 @@ def check_archive(path, limit):
         if size > limit or archive.testzip():
             raise ValueError(f"altered, or a bomb: it would unpack to {size:,} bytes")
 
+def save_rows(path, rows):
+    """Write an episode: an array that np.load opens, and behind it a checksum."""
+    buffer = io.BytesIO()
+    np.save(buffer, rows)
+    content = buffer.getvalue()
+    with atomic(path) as file:
+        file.write(content + struct.pack("<I", zlib.crc32(content)))
+
 class Replay:
     """Finished episodes, a file each, laid end to end; windows start uniformly anywhere.
         episodes    ┌──────── 0 ────────┐┌──── 1 ────┐┌─────── 2 ──────
@@ -796,8 +804,9 @@ class Replay:
     are np.load(path)["image"]. Fields that are not in `dtype` are left unread."""
     def __init__(self, folder, dtype=VIDEO, capacity=None):
         self.folder, self.dtype, self.capacity = Path(folder), dtype, capacity
+        self.checked, paths = set(), sorted(self.folder.glob("*.npy"))
         # All files: a checkpoint may need those that the ones after it pushed out.
-        self._hold([(path, len(self.read(path))) for path in sorted(self.folder.glob("*.npy"))])
+        self._hold([(path, len(self.read(path, check=False))) for path in paths])
         last = self.paths[-1].stem if self.paths else ""
         self.next_index = int(last) + 1 if last.isdecimal() else 0
 
@@ -807,9 +816,15 @@ class Replay:
         self.ends = np.cumsum([length for _, length in episodes], dtype=int).tolist()
         self.rows = self.ends[-1] if episodes else 0
 
-    def read(self, path):
-        """An episode's rows, mapped, not read. UserError unless it has the fields of `dtype`."""
+    def read(self, path, check=True):
+        """An episode's rows, mapped into memory. UserError unless it has the fields of `dtype` and,
+        looked at once, the checksum that it was saved with."""
         with reading(path, f"episode with {', '.join(self.dtype.names)}", "remove it"):
+            if check and path not in self.checked:
+                content = path.read_bytes()
+                if struct.pack("<I", zlib.crc32(content[:-4])) != content[-4:]:
+                    raise ValueError("it was altered: its checksum is another")
+                self.checked.add(path)
             rows = np.load(path, mmap_mode="r", allow_pickle=False)
             if rows.ndim != 1 or not len(rows):
                 raise ValueError(f"its shape is {rows.shape}")
@@ -825,8 +840,7 @@ class Replay:
         path, episode = self.folder / f"{self.next_index:06d}.npy", np.empty(len(rows), self.dtype)
         for name in self.dtype.names:
             episode[name] = more[name] if name in more else [row[name] for row in rows]
-        with atomic(path) as file:
-            np.save(file, episode)
+        save_rows(path, episode)
         self._hold([*self.episodes, (path, len(rows))])
         while self.capacity and self.rows - self.ends[0] >= self.capacity:
             self._hold(self.episodes[1:])
@@ -889,10 +903,9 @@ def open_videos(folder, cache):
                 if image.dtype != np.uint8 or image.shape != (len(image) or 1, 64, 64, 3):
                     raise ValueError(f"image is {image.dtype} {image.shape}, "
                                      "not uint8 (T, 64, 64, 3)")
-            with atomic(unpacked) as file:
-                rows = np.zeros(len(image), VIDEO)
-                rows["image"], rows["is_first"][0] = image, True
-                np.save(file, rows)
+            rows = np.zeros(len(image), VIDEO)
+            rows["image"], rows["is_first"][0] = image, True
+            save_rows(unpacked, rows)
     return Replay(cache)
 
 # === Environments =================================================================================
