@@ -1228,13 +1228,13 @@ def read_checkpoint(path):
                         "python diswm.py finetune --dst walker_walk")
     with reading(path):
         check_archive(path, os.path.getsize(path))  # torch.load looks at no checksum
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = dict(torch.load(path, map_location="cpu", weights_only=True))
         state["config"] = Config(**state["config"])
         tensors = [x for x in tree_leaves(state["trainer"]) if isinstance(x, torch.Tensor)]
         if not all(x.dtype in (torch.float32, torch.int64) and x.isfinite().all() for x in tensors):
             raise ValueError("not all weights are finite float32")
         int(state["trainer"]["progress"])
-        return dict(state) | {key: state[key] for key in ("stage", "trainer", "rng", "log_bytes")}
+        return state | {key: state[key] for key in ("stage", "trainer", "rng", "log_bytes")}
 
 class Run:
     """A run's folder: checkpoint.pt, config.json, metrics.jsonl, TensorBoard events."""
