@@ -3481,11 +3481,17 @@ def test_runs_folder_that_cannot_be_written_is_one_line(command, tmp_path):
     assert (tmp_path / "runs").read_text() == "in the way"
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+@pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write")
 def test_read_only_runs_folder_is_one_line(tmp_path):
-    """Permission denied."""
+    """Permission denied; root gives up its right to write anywhere first."""
+    caps = "-dac_override,-dac_read_search"
+    user = ["setpriv", f"--bounding-set={caps}", f"--inh-caps={caps}"] if os.geteuid() == 0 else []
     tmp_path.chmod(0o500)
-    refuse("collect", "--runs", tmp_path / "runs", *DEBUG, says="Permission denied")
+    done = subprocess.run([*user, sys.executable, diswm.__file__, "collect", *DEBUG, "--runs",
+                           tmp_path], capture_output=True, text=True)
+    tmp_path.chmod(0o700)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("error: ") and "Permission denied" in done.stderr
 
 
 @pytest.mark.parametrize("loss, term", [
