@@ -145,12 +145,13 @@ class Config:
     reward_scale: float = flag(2.0, "weight of the reward loss (published)")
     discount_scale: float = flag(1.0, "weight of the discount loss (ours)")
     # Distillation, Eq. (3). Its clock counts decisions, prefill included.
-    distill: str = flag("softmax", "latents in Eq. (3) (paper; ours)", ("softmax", "gaussian"))
+    distill: str = flag("softmax", "Eq. (3) of softmaxed or of Gaussian latents (paper; ours)",
+                        ("softmax", "gaussian"))
     eta: float = flag(0.1, "η at the start (table)")
     eta_end: float = flag(0.01, "η at the end (paper, section 3.4)")
     eta_decay: int = flag(50_000, "decisions in which η would fall to 0 (published)", low=1)
-    eta_delay: int = flag(-1, "decisions before; -1: 0, or eta_decay across domains (published)",
-                          low=-1)
+    eta_delay: int = flag(-1, "decisions before it; -1: eta_decay across domains, else 0 "
+                          "(published)", low=-1)
     # Behaviour, appendix B.
     horizon: int = flag(15, "imagined transitions, H (table)", low=1, high=1_000)
     imagine_starts: int = flag(0, "states of a batch to imagine from; 0: all (ours)")
@@ -1496,10 +1497,11 @@ def evaluate_agent(cfg, agent, envs, phase, replay=None):
 
 # === Stages =======================================================================================
 
+MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")  # this machine's, bytes
+
 def memory_needed(cfg):
     """GB, as measured. Raises UserError where this machine has less."""
-    memory = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5
-    have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    memory, have = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5, MEMORY / 1e9
     if cfg.device == "cpu" and memory > have:
         raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
                         "take a smaller --batch-size, --batch-length or --cnn-depth")
@@ -1853,16 +1855,19 @@ def plot(cfg, folders, path):
 # === Doctor and bench =============================================================================
 
 def machine(cfg):
+    """What runs here, and on what."""
     versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
     return dict(device=cfg.device, precision=cfg.precision, threads=torch.get_num_threads(),
                 gl=os.environ["MUJOCO_GL"], versions=versions | dict(python=sys.version.split()[0]))
 
 def show(result):
+    """Print a dict of dicts, a line for each value."""
     for name, value in result.items():
         for part, number in value.items() if isinstance(value, dict) else [("", value)]:
             print(f"{f'{name} {part}':30}", f"{number:.4g}" if type(number) is float else number)
 
 def family_tasks(cfg):
+    """A task of each family."""
     dmc = cfg.dst if cfg.dst in TASKS else "walker_walk"
     return dmc, "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5"
 
@@ -1993,9 +1998,8 @@ def prepare_machine(cfg):
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     torch.set_num_threads(cfg.threads or os.cpu_count())
     if device == "cpu":  # what is too large fails as an error, and is not killed
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        limit = memory if soft == resource.RLIM_INFINITY else min(soft, memory)
+        limit = MEMORY if soft == resource.RLIM_INFINITY else min(soft, MEMORY)
         resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
     if platform.libc_ver()[0] == "glibc":
         # Large buffers go back to the kernel each step otherwise: 1.9× of a step at 50 × 50.
