@@ -487,6 +487,8 @@ class VideoPredictor(nn.Module):
         rssm = StackedRSSM if action_dim and cfg.carry_over == "stack" else RSSM
         self.rssm = rssm(action_dim, cfg.z_dim if vae else 32 * d, cfg.stoch, cfg.deter, cfg.hidden)
         self.scales = dict(image=1.0, kl=cfg.beta1, disentangle=cfg.beta2)
+        if cfg.compile:
+            self.compile()
 
     def forward(self, batch):
         """Filter → dict of code (of encode), post, prior, feat."""
@@ -670,7 +672,6 @@ class Agent:
                                actor=Adam(self.behaviour.actor, cfg.actor_lr),
                                critic=Adam(self.behaviour.critic, cfg.critic_lr))
         if cfg.compile:
-            self.model.compile()
             self.behaviour.imagine = torch.compile(self.behaviour.imagine)
 
     @torch.no_grad()
@@ -1373,8 +1374,6 @@ class VideoTrainer(Trainer):
     def __init__(self, cfg, videos, device):
         self.cfg, self.videos, self.device = cfg, videos, device
         self.model = VideoPredictor(cfg).to(device)
-        if cfg.compile:
-            self.model.compile()
         self.optimizer = Adam(self.model, cfg.model_lr)
         self.progress, self.metrics, self.total = 0, [], cfg.pretrain_updates
 
