@@ -7,13 +7,13 @@ CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")"
 # Left to itself, MuJoCo picks GLFW, which needs a display.
 export MUJOCO_GL=${MUJOCO_GL:-egl}
 
-# The small preset, cut down until all of it fits into 15 minutes on two CPU cores.
+# The small preset, cut down until all of it takes ten minutes on two CPU cores.
 tour=(--preset small --collect-steps 4000 --pretrain-updates 200 --steps 8000 --prefill 1000
       --eval-every 4000 --eval-episodes 3)
 
 usage() {
     cat <<'EOF'
-usage: bash run_all.sh                 a tour of the whole pipeline: 15 minutes on two CPU cores
+usage: bash run_all.sh                 a tour of the whole pipeline: ten minutes on two CPU cores
        PRESET=small bash run_all.sh    the real thing, sized for two CPU cores: hours
        PRESET=paper bash run_all.sh    the paper's size: wants a GPU
        bash run_all.sh test [ARGS]     ruff and the tests; ARGS go to pytest, as in: test -k replay
@@ -53,6 +53,10 @@ find_python() {
  Ubuntu 24.04: apt-get install -y python3 python3-venv; or name one: PYTHON=/path/to/python"
 }
 
+install() {
+    .venv/bin/python -m pip install --disable-pip-version-check "$@"
+}
+
 make_venv() {
     local python stamp=.venv/requirements.sha256
     if ! usable_python .venv/bin/python pip; then
@@ -63,7 +67,11 @@ make_venv() {
     # The stamp is written last: after an interrupted or changed installation it does not fit.
     if ! sha256sum --check --status "$stamp" 2>/dev/null; then
         echo "Installing requirements.txt into .venv: some minutes, this once"
-        .venv/bin/python -m pip install --disable-pip-version-check -r requirements.txt
+        if ! command -v nvidia-smi >/dev/null; then  # PyPI's torch brings gigabytes of CUDA along
+            install "$(grep ^torch== requirements.txt)" --timeout 20 --retries 1 \
+                --index-url https://download.pytorch.org/whl/cpu || echo "Taking PyPI's torch"
+        fi
+        install -r requirements.txt
         sha256sum requirements.txt >"$stamp"
     fi
 }

@@ -2455,6 +2455,22 @@ def test_plot_titles_name_both_tasks(tasks, title, tmp_path, monkeypatch):
     assert titles == [title]
 
 
+def test_plot_shows_returns_below_zero(tmp_path, monkeypatch):
+    """The bug it kills: from 0 up, the pusher's curve, −300 … −72, was outside the picture."""
+    from matplotlib.axes import Axes
+    drawn, real = [], Axes.set
+    monkeypatch.setattr(
+        Axes, "set", lambda self, **values: drawn.append(self) or real(self, **values))
+    for task, value in (("pusher", -300.0), ("walker_walk", 300.0)):
+        folder = tmp_path / f"cheetah_run-{task}/diswm/seed0"
+        folder.mkdir(parents=True)
+        rows = [dict(step=step, eval_return=value / step, phase="train") for step in (1, 2)]
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    succeed("plot", *tmp_path.glob("*/*/*"), "--out", tmp_path / "curves.png")
+    lows = sorted(axes.get_ylim()[0] for axes in drawn)
+    assert lows[0] < -300 and lows[1] == 0
+
+
 def test_bench_reports_times_memory_and_parameters_as_one_json_object():
     """Issue 4: names with units; what the paper calls 5.8 M parameters is counted by part."""
     result = json.loads(succeed("bench", "--json", "--scaling", "--repeats", 1, *DEBUG))
