@@ -215,6 +215,7 @@ def gaussian_kl(mean_p, std_p, mean_q, std_q):
 def beta_vae_kl(mean, logvar):
     """Disentanglement loss of Eqs. (2), (5): KL[N(mean, exp(logvar)) || N(0, I)].
     mean, logvar: (..., Z). Returns (...,), nats summed over the latent dimensions."""
+    # DEVIATION: the published one adds 1e-6; this is exactly 0 at N(0, I).
     return 0.5 * (mean**2 + logvar.exp() - 1 - logvar).sum(-1)  # ½ Σ (μ² + σ² − 1 − ln σ²)
 
 def rssm_kl_loss(post, prior, balance=0.8, free_nats=1.0):
@@ -493,6 +494,7 @@ class VideoPredictor(nn.Module):
 
     def forward(self, batch):
         """Filter → dict of code (of encode), post, prior, feat."""
+        # DEVIATION: published, a video predictor sees means of latents and actions that are zero.
         code = self.encoder.encode(batch["image"])
         post, prior = self.rssm.observe(code["embed"], batch.get("action"), batch["is_first"])
         return dict(code=code, post=post, prior=prior, feat=self.rssm.feat(post))
@@ -655,10 +657,11 @@ def gradient_step(optimizer, loss, clip):
     return norm
 
 def check_finite(metrics):
-    """An update's metrics, as they are. Raises FloatingPointError unless all are finite, with the
-    names of the first that are not. Here, once an update, one waits for a GPU."""
-    finite = torch.stack(list(metrics.values())).isfinite().tolist()
-    bad = [name for name, good in zip(metrics, finite, strict=True) if not good]
+    """An update's metrics as floats: here, once an update, one waits for a GPU.
+    Raises FloatingPointError, with the names of the first that are not finite, unless all are."""
+    values = torch.stack([value.float() for value in metrics.values()]).tolist()
+    metrics = dict(zip(metrics, values, strict=True))
+    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
     if bad:
         raise FloatingPointError(f"non-finite {', '.join(bad[:3])}")
     return metrics
@@ -898,7 +901,7 @@ def open_videos(folder, cache):
     cache.mkdir(parents=True, exist_ok=True)
     for path in paths:
         unpacked = cache / f"{path.name}.npy"
-        if not unpacked.exists():
+        if not unpacked.exists() or os.path.getmtime(unpacked) < os.path.getmtime(path):
             with reading(path, "video", "remove it"):
                 if path.suffix == ".npz":
                     check_archive(path, max(2**30, 100 * os.path.getsize(path)))
@@ -919,7 +922,7 @@ OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
 PHASES = ("train", "shifted", "eval", "none")
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
 MATERIALS = dict(grid="floor", self="body")  # dm_control's names
-TRAINING, EVALUATION = 0, 1  # streams of episode_seed
+TRAINING, EVALUATION, PRETRAINING = 0, 1, 2  # streams of episode_seed
 if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its last lines
     for name in (*TASKS, *OTHER_TASKS):
         gym.register(f"DisWM/{name}-v0", "diswm:make_env", kwargs=dict(task=name))
@@ -1189,7 +1192,13 @@ def padded_actions(cfg, action_dim):
 
 def episode_seed(seed, stream, index):
     """Of the run's seed, the purpose and the index."""
+    # DEVIATION: published colours and weights are unseeded, and the replay's sampler has seed 0.
     return int(np.random.SeedSequence([seed, stream, index]).generate_state(1)[0])
+
+def initial_seed(cfg, model):
+    """Of a model class's first weights. A teacher's are not its student's: else Eq. (3), which
+    compares latents one by one, would find them aligned from the start."""
+    return episode_seed(cfg.seed, PRETRAINING, 0) if model is VideoPredictor else cfg.seed
 
 def play_episodes(envs, policy, seeds, phase, each=None):
     """Play an episode in each environment → [(rows of make_row, return, success or None), …].
@@ -1212,7 +1221,7 @@ def play_episodes(envs, policy, seeds, phase, each=None):
 
 def random_policy(seeds):
     """Uniform actions in [−1, 1], from a stream for each environment."""
-    rngs = [np.random.default_rng(seed) for seed in seeds]
+    rngs = [np.random.default_rng([seed, 2]) for seed in seeds]               # not the simulator's
     return lambda images, actions, state: (
         np.array([rng.uniform(-1, 1, actions.shape[1:]) for rng in rngs], np.float32), None)
 
@@ -1253,15 +1262,20 @@ class Run:
             fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # a process that dies lets go
         except BlockingIOError:
             raise UserError(f"another process is at work in {self.folder}; stop it first") from None
-        for path in set(self.folder.iterdir()) - {self.folder / "lock"} if fresh else ():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        self.state = read_checkpoint(self.checkpoint) if self.checkpoint.exists() else None
+        whole = self.checkpoint.exists() and not fresh
+        self.state = read_checkpoint(self.checkpoint) if whole else None
         old, new = vars(self.state["config"] if self.state else cfg), vars(cfg)
         differ = [f"{f.name} {old[f.name]} (now {new[f.name]})" for f in dataclasses.fields(cfg)
                   if old[f.name] != new[f.name] and not f.metadata["free"]]
         if differ:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
+
+    def clear(self, videos=None):
+        """What --fresh replaces goes, late: nothing is lost to a mistake in the command."""
+        kept = {self.folder / "lock", self.folder / "videos", videos}
+        for path in {*self.folder.iterdir(), *self.folder.glob("videos/*")} - kept:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def save(self, trainer):
         """Write the checkpoint, whole or not at all."""
@@ -1347,10 +1361,9 @@ def train(trainer, run):
     print(f"done: {run.folder}")
 
 def mean_metrics(rows):
-    """The average of several updates' metrics: list of dicts of scalar tensors → dict of floats."""
+    """The average of several updates' metrics: list of dicts of scalars → dict of floats."""
     names = sorted({name for row in rows for name in row})
-    return {name: torch.stack([row[name] for row in rows if name in row]).float().mean().item()
-            for name in names}
+    return {name: statistics.fmean(row[name] for row in rows if name in row) for name in names}
 
 class Trainer:
     """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics or
@@ -1461,9 +1474,11 @@ class AgentTrainer(Trainer):
                    train_length=statistics.mean(len(episode) - 1 for episode in rows))
         row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
         row |= {} if None in success else dict(train_success=statistics.fmean(success))
-        if self.progress >= self.total or self.progress // cfg.eval_every > start // cfg.eval_every:
+        due = self.progress - self.progress % cfg.eval_every
+        if self.progress >= self.total or due > start:
             result = evaluate_agent(cfg, self.agent, self.envs, judged_phase(cfg, self.phase))
             row["eval_return"] = result.pop("mean")
+            row["eval_step"] = self.total if self.progress >= self.total else due
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
 
@@ -1538,6 +1553,7 @@ def find_teacher(cfg, device):
     found = [own / "checkpoint.pt", *sorted(own.parent.glob("seed*/checkpoint.pt"))]
     path = Path(cfg.teacher) if cfg.teacher else next(filter(Path.exists, found), None)
     command = f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method}"
+    command += f" --runs {cfg.runs}" * (cfg.runs != Config.runs)
     if cfg.src == cfg.dst:
         raise UserError(f"source and target are both {cfg.src}; choose another --src")
     if path is None:
@@ -1546,8 +1562,12 @@ def find_teacher(cfg, device):
     done = state["trainer"]["progress"]
     if state["stage"] != "pretrain" or saved.encoder != ("beta_vae" if cfg.eta else cfg.encoder):
         raise UserError(f"{path} is a {saved.encoder} {state['stage']} run, no teacher; {command}")
+    if cfg.eta and cfg.encoder != "beta_vae":
+        raise UserError("Eq. (3) wants a β-VAE's latents; add --encoder beta_vae, or --eta 0")
     if saved.src == cfg.dst:
         raise UserError(f"{path} saw videos of the target, {cfg.dst}; choose another --src")
+    if saved.src != cfg.src:  # the run's folder and η's delay follow it
+        raise UserError(f"{path} saw videos of {saved.src}; add --src {saved.src}")
     carried = ("cnn_depth", "stoch", "deter", "hidden") if cfg.carry_over != "none" else ()
     for name in ("z_dim", *carried):
         if (size := getattr(saved, name)) != getattr(cfg, name):
@@ -1556,6 +1576,13 @@ def find_teacher(cfg, device):
         raise UserError(f"{path} is not finished ({done} of {saved.pretrain_updates}); {command}")
     print(f"teacher: {path} ({saved.src}, {done:,} updates)")
     return model
+
+def finished(folder):
+    """Has a run there come to its end?"""
+    if not (folder / "checkpoint.pt").exists():
+        return False
+    state = read_checkpoint(folder / "checkpoint.pt")
+    return int(state["trainer"]["progress"]) >= state["config"].steps
 
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1, DreamerV2)."""
@@ -1570,16 +1597,18 @@ def pretrain(cfg, fresh=False):
     run, folder = Run(cfg, "pretrain", fresh), Path(cfg.videos)
     if not cfg.videos:
         own = run_folder(replace(cfg, method="dreamerv2"), "collect")
-        others = [path.parent for path in sorted(own.parent.glob("seed*/checkpoint.pt"))]
-        # One video set serves all seeds; an unfinished one is finished.
-        folder = (collect(cfg) if own in others or not others else others[0]) / "episodes"
+        # One video set serves all seeds; without a whole one, the own is begun or finished.
+        whole = filter(finished, [own, *sorted(own.parent.glob("seed*"))])
+        folder = (next(whole, None) or collect(cfg)) / "episodes"
     videos = open_videos(folder, run.folder / "videos")
     if videos.rows < cfg.batch_length:
         raise UserError(f"{folder} has {videos.rows} frames, less than one window of "
                         f"{cfg.batch_length}; collect more, or lower --batch-length")
     print(f"videos: {folder}, {len(videos.paths):,} episodes, {videos.rows:,} frames")
     announce(run, 0)
-    torch.manual_seed(cfg.seed)
+    if fresh:
+        run.clear(videos.folder)
+    torch.manual_seed(initial_seed(cfg, VideoPredictor))
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
 def finetune(cfg, fresh=False, stage="finetune"):
@@ -1592,7 +1621,9 @@ def finetune(cfg, fresh=False, stage="finetune"):
         video = find_teacher(cfg, device)
         teacher = freeze(video.encoder) if cfg.eta > 0 else None
     announce(run, cfg.steps // cfg.action_repeat)
-    torch.manual_seed(cfg.seed)
+    if fresh:
+        run.clear()
+    torch.manual_seed(initial_seed(cfg, WorldModel))
     trainer = AgentTrainer(run.cfg, run.folder, device, teacher)
     if video and cfg.carry_over != "none":
         trainer.agent.model.carry_over(video)
@@ -1603,11 +1634,11 @@ def finetune(cfg, fresh=False, stage="finetune"):
 def evaluate(cfg, folder):
     """Play episodes with a run's policy and with a random one; JSON and mp4 (stage 4).
     The actor's mode acts. Writes evaluation.json, its episodes, and the first as evaluation.mp4."""
-    cfg, agent, state = load_model(folder / "checkpoint.pt", torch.device(cfg.device))
+    _, agent, state = load_model(folder / "checkpoint.pt", torch.device(cfg.device))
     step = state["trainer"]["progress"]
     if not isinstance(agent, Agent):
         raise UserError(f"{folder} is a video predictor without a policy; give a finetune run")
-    switched = step >= int(cfg.switch * cfg.steps) < cfg.steps                # as while it trained
+    switched = cfg.steps > int(cfg.switch * cfg.steps) < step                 # as while it trained
     phase = judged_phase(cfg, "shifted" if switched else "train")
     result = dict(task=cfg.dst, phase=phase, step=step)
     shutil.rmtree(folder / "evaluation", ignore_errors=True)
@@ -1615,8 +1646,8 @@ def evaluate(cfg, folder):
     for name, policy in (("", agent), ("random_", None)):                  # which need not see
         with contextlib.closing(config_envs(cfg, cfg.dst, pixels=bool(policy))) as envs:
             if envs.single_action_space.shape != (agent.action_dim,):
-                raise UserError(f"{folder} has {agent.action_dim} actions, unlike its {cfg.dst}; "
-                                "its checkpoint was altered: train it again with --fresh")
+                raise UserError(f"{folder} has {agent.action_dim} actions, unlike {cfg.dst}; give "
+                                "another --dst, or train it again with --fresh: it was altered")
             more = evaluate_agent(cfg, policy, envs, phase, replay if policy else None)
         result |= {name + key: value for key, value in more.items()}
         success = f", success {more['success']:.0%}" if "success" in more else ""
@@ -1719,7 +1750,7 @@ def disentanglement(codes, factors):
 def measure(cfg, model, teacher, path):
     """Score encoders, print and write JSON. Returns what each latent of the model follows most."""
     images, factors, names = labelled_frames(cfg)
-    torch.manual_seed(cfg.seed)                                               # as training began
+    torch.manual_seed(initial_seed(cfg, type(model)))                         # as training began
     start = type(model)(cfg, model.rssm.action_dim).to(cfg.device).encoder
     encoders = (dict(teacher=teacher) if teacher else {}) | dict(start=start, end=model.encoder)
     frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
@@ -1788,7 +1819,8 @@ def read_log(folder):
         for row in rows:
             step = row["step" if "phase" in row else "update"]                # an agent's or not
             known = type(row.get("phase", "")) is str
-            if not (known and math.isfinite(step + row.get("eval_return", 0))):
+            figures = step, row.get("eval_return", 0), row.get("eval_step", 0)
+            if not (known and math.isfinite(sum(figures))):
                 raise ValueError(f"step {step}")
     return rows
 
@@ -1821,7 +1853,8 @@ def plot(cfg, folders, path):
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
     for folder in folders or sorted(Path(cfg.runs).glob("finetune/*/*/seed*")):
         rows = [row for row in read_log(folder) if "phase" in row]
-        if curve := {row["step"]: row["eval_return"] for row in rows if "eval_return" in row}:
+        evaluated = [row for row in rows if "eval_return" in row]
+        if curve := {row.get("eval_step", row["step"]): row["eval_return"] for row in evaluated}:
             tasks, method, _ = folder.resolve().parts[-3:]
             curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
             last = {row["phase"]: row["step"] for row in rows}                # of each phase
@@ -1829,7 +1862,8 @@ def plot(cfg, folders, path):
                 switches[tasks] = last["train"]
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
-    figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), path or Path(cfg.runs) / "curves.png"
+    figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), path or Path(cfg.runs) / "curves"
+    path = path.with_suffix(".png")
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
         for method, runs in sorted(methods.items()):
@@ -1960,13 +1994,14 @@ def parse_args(argv):
     """The command line → (function, Config, more arguments). Config: preset, then method, flags."""
     parser = Parser(prog="diswm.py", description="Disentangled World Models.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    fields = dataclasses.fields(Config)
     for name, own in COMMANDS.items():
         help = (globals()[name].__doc__ or name).split("\n")[0]              # -OO has none
         sub = commands.add_parser(name, help=help, description=help, allow_abbrev=False)
         sub.add_argument("--preset", choices=PRESETS, help="default: paper on CUDA, else small")
         for flag, options in (FRESH | own).items():
             sub.add_argument(flag, **options)
-        for field in dataclasses.fields(Config):
+        for field in fields:
             meta, kind = field.metadata, type(field.default)
             choices = METHODS if field.name == "method" else meta["choices"]
             options = dict(action=argparse.BooleanOptionalAction) if kind is bool else dict(
@@ -1980,8 +2015,13 @@ def parse_args(argv):
         sub.error(f"unrecognized arguments: {' '.join(unknown)}")
     given = {key: value for key, value in args.items() if key in Config.__dataclass_fields__}
     preset = args["preset"] or ("paper" if torch.cuda.is_available() else "small")
+    if "--run" in own:  # as it was trained, but for what is given
+        saved = read_checkpoint(args["run"] / "checkpoint.pt")["config"]
+        known = {f.name: getattr(saved, f.name) for f in fields if not f.metadata["free"]}
+    else:
+        known = METHODS[given.get("method", "diswm")]
     try:
-        cfg = replace(PRESETS[preset], **METHODS[given.get("method", "diswm")] | given)
+        cfg = replace(PRESETS[preset], **known | given)
     except ValueError as error:
         sub.error(str(error))
     if not args["preset"] and "--fresh" in own:
@@ -1995,9 +2035,10 @@ def prepare_machine(cfg):
     device = cfg.device.replace("auto", "cuda" if torch.cuda.is_available() else "cpu")
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("there is no CUDA device; use --device cpu")
-    native = device == "cuda" or torch.cpu.get_capabilities().get("avx512_bf16")
+    native = (torch.cuda.is_bf16_supported(including_emulation=False) if device == "cuda"
+              else torch.cpu.get_capabilities().get("avx512_bf16"))
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
-    torch.set_num_threads(cfg.threads or os.cpu_count())
+    torch.set_num_threads(cfg.threads or len(os.sched_getaffinity(0)))
     if device == "cpu":  # what is too large fails as an error, and is not killed
         soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
         limit = MEMORY if soft == resource.RLIM_INFINITY else min(soft, MEMORY)

@@ -1409,6 +1409,13 @@ def test_evaluation_episodes_align_like_training_episodes():
     assert np.isclose(total, rows["reward"].sum()) and not rows["is_terminal"].any()
 
 
+def test_random_actions_are_not_the_simulators_own_random_numbers():
+    """The bug it kills: of the same seed, the first one told where Pusher's cylinder stands."""
+    action, _ = diswm.random_policy([5])(None, np.zeros((1, 4)), None)
+    same, _ = gym.utils.seeding.np_random(5)
+    assert np.abs(action[0] - same.uniform(-1, 1, 4)).max() > 0.01
+
+
 # === Environments =================================================================================
 
 def roll(env, seed, steps=4, phase=None):
@@ -1886,6 +1893,56 @@ def test_finetune_refuses_an_unfinished_teacher(teacher, tmp_path):
            says=("7 of 20", "python diswm.py pretrain --src cheetah_run"))
 
 
+def test_finetune_refuses_a_teacher_of_another_source(teacher, tmp_path):
+    """The run's folder, and whether η waits, follow --src: it has to be the teacher's."""
+    refuse("finetune", "--src", "pusher", "--teacher", teacher, "--runs", tmp_path, *DEBUG,
+           says="add --src cheetah_run")
+
+
+def test_missing_teacher_is_looked_for_and_made_in_the_same_runs(tmp_path):
+    """The command that it names mends it, wherever the runs are."""
+    refuse("finetune", "--runs", tmp_path, *DEBUG, says=f"--method diswm --runs {tmp_path}")
+
+
+def test_distillation_refuses_an_encoder_without_latents(teacher, tmp_path):
+    """Eq. (3) compares 20 latents with 20 latents."""
+    refuse("finetune", "--encoder", "conv", "--teacher", teacher, "--runs", tmp_path, *DEBUG,
+           says=("β-VAE", "--encoder beta_vae"))
+
+
+def test_teacher_and_student_of_one_seed_start_apart(root, teacher, tmp_path, monkeypatch):
+    """The bug it kills: with the same first weights, their latents were aligned one by one (r = .3
+    after 1 000 updates of the teacher, .0 for any other seed) before Eq. (3) had done anything."""
+    encoders = {}
+
+    def note(trainer, run):
+        model = trainer.agent.model if run.stage == "finetune" else trainer.model
+        encoders.setdefault(run.stage, []).append(
+            torch.cat([p.detach().flatten() for p in model.encoder.parameters() if p.ndim > 1]))
+    monkeypatch.setattr(diswm, "train", note)
+    videos = next((root / "runs/collect").rglob("episodes"))
+    for runs in (tmp_path / "a", tmp_path / "b"):
+        succeed("pretrain", "--videos", videos, "--runs", runs, *DEBUG)
+        succeed("finetune", "--teacher", teacher, "--runs", runs, *DEBUG)
+    (video, again), (agent, agent_again) = encoders["pretrain"], encoders["finetune"]
+    assert torch.equal(video, again) and torch.equal(agent, agent_again)
+    assert torch.cosine_similarity(video, agent, dim=0).abs() < 0.1
+
+
+def test_one_whole_video_set_serves_other_seeds_and_other_pretrainings(root, tmp_path):
+    """The bugs it kills: a pretraining with other latents was refused, as the collecting had been
+    started with another z_dim; and one with another seed took an unfinished set."""
+    shutil.copytree(root / "runs/collect", tmp_path / "collect")
+    argv = ("pretrain", "--runs", tmp_path, *DEBUG, "--pretrain-updates", 2)
+    said = succeed(*argv, "--z-dim", 10) + succeed(*argv, "--seed", 1)
+    assert "collect dreamerv2" not in said
+    checkpoint = tmp_path / COLLECTED / "checkpoint.pt"
+    state = torch.load(checkpoint, weights_only=True)
+    state["trainer"]["progress"] -= 50
+    torch.save(state, checkpoint)
+    assert "seed2/episodes" in succeed(*argv, "--seed", 2)
+
+
 def test_evaluate_refuses_a_run_without_a_policy(teacher):
     """A video predictor cannot act."""
     refuse("evaluate", "--run", teacher.parent, says="finetune")
@@ -2328,6 +2385,7 @@ def test_pipeline_counts_env_steps_and_switches_once(finished):
     assert all(row["step"] == 2 * row["decisions"] for row in rows)
     assert [row["phase"] for row in rows] == ["train"] * 3 + ["shifted"] * 3
     assert [row["step"] for row in rows if "eval_return" in row] == [100, 200, 300]
+    assert [row["eval_step"] for row in rows if "eval_return" in row] == [100, 200, 300]
 
 
 def test_pipeline_evaluates_draws_and_plots(finished, teacher, root):
@@ -2348,6 +2406,15 @@ def test_pipeline_evaluates_draws_and_plots(finished, teacher, root):
     check_picture(root / "curves.png")
 
 
+def test_checkpoint_between_two_log_rows_holds_plain_numbers(root):
+    """The bug it kills: they were tensors of the GPU, and on resuming of the CPU: not one mean."""
+    videos = Replay(next((root / "runs/collect").rglob("episodes")))
+    trainer = diswm.VideoTrainer(tiny_config(), videos, CPU)
+    assert trainer.advance() is None
+    row, = trainer.state_dict()["metrics"]
+    assert {type(value) for value in row.values()} == {float}
+
+
 def test_pipeline_continues_a_finished_run_by_doing_nothing(finished, root):
     """The same command run again resumes where it stopped: at the end."""
     before = {path: path.read_bytes() for path in finished.rglob("*.npy")}
@@ -2364,6 +2431,38 @@ def test_fresh_starts_over_and_other_flags_are_refused(root, tmp_path):
     succeed(*argv)
     refuse(*argv, "--beta2", 0.5, says=("beta2", "--fresh"))
     succeed(*argv, "--beta2", 0.5, "--fresh")
+
+
+def test_fresh_loses_nothing_to_a_mistake(finished, tmp_path):
+    """The bug it kills: the old run was gone before the new one's teacher was looked for."""
+    run = tmp_path / FINETUNED
+    shutil.copytree(finished, run)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    argv = ("finetune", "--runs", tmp_path, *DEBUG, "--fresh")
+    refuse(*argv, "--teacher", tmp_path / "nope.pt", says="nope.pt")
+    refuse(*argv, "--batch-size", 10**6, "--batch-length", 1000, "--teacher",
+           finished.parents[3] / PRETRAINED / "checkpoint.pt", says="memory")
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_evaluate_plays_as_it_was_trained_but_for_what_it_is_given(finished, tmp_path):
+    """The bug it kills: --eval-episodes was accepted, and the run's own number played."""
+    run = tmp_path / FINETUNED
+    shutil.copytree(finished, run)
+    out = succeed("evaluate", "--run", run, "--eval-episodes", 3, "--colors", "original")
+    assert "3 episodes each" in out
+    assert len(json.loads((run / "evaluation.json").read_text())["returns"]) == 3
+
+
+def test_evaluate_at_the_midpoint_has_the_colours_that_training_had(finished, tmp_path):
+    """The episode that the switch ends, and its evaluation, have the first colours."""
+    run = tmp_path / FINETUNED
+    shutil.copytree(finished, run)
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    for step, phase in ((150, "train"), (152, "shifted")):
+        state["trainer"]["progress"] = step
+        torch.save(state, run / "checkpoint.pt")
+        assert f"{phase} colours" in succeed("evaluate", "--run", run)
 
 
 @pytest.mark.parametrize("method", ["dreamerv2", "no_distill"])
@@ -2413,7 +2512,7 @@ def test_cross_domain_pipeline_waits_with_distillation_and_evaluates(task, teach
 def test_tasks_with_early_ends_dict_observations_and_1_to_21_actions_train(task, actions, tmp_path):
     """Hopper falls: its last row is terminal and has discount 0. Fetch only counts its steps."""
     succeed("finetune", "--dst", task, "--method", "dreamerv2", "--runs", tmp_path, *DEBUG,
-            "--steps", 160, "--eval-every", 1000)
+            "--steps", 160, "--eval-every", 80)
     run, = tmp_path.rglob("seed0")
     assert run.parent.parent.name == f"cheetah_run-{task}"
     assert read_rows(run)[-1]["updates"] > 0
@@ -2424,6 +2523,9 @@ def test_tasks_with_early_ends_dict_observations_and_1_to_21_actions_train(task,
         assert not episode["is_terminal"][:-1].any()
         ends.append(bool(episode["is_terminal"][-1]))
     assert any(ends) == (task == "Hopper-v5")
+    evaluated = [row for row in read_rows(run) if "eval_return" in row]
+    assert [row["eval_step"] for row in evaluated] == [80, 160]  # due, and done soon after
+    assert all(0 <= row["step"] - row["eval_step"] < 50 for row in evaluated)
 
 
 def test_evaluation_files_and_returns_are_those_of_an_env_that_counts(tmp_path):
@@ -2453,6 +2555,20 @@ def test_plot_titles_name_both_tasks(tasks, title, tmp_path, monkeypatch):
     (folder / "metrics.jsonl").write_text('{"step": 10, "eval_return": 1.0, "phase": "train"}\n')
     succeed("plot", folder, "--out", tmp_path / "curves.png")
     assert titles == [title]
+
+
+def test_plot_joins_seeds_whose_episodes_end_early(tmp_path):
+    """Where an episode may end any time, evaluations happen a few steps after they are due."""
+    for seed, late in enumerate((12, 20)):
+        folder = tmp_path / f"a-b/diswm/seed{seed}"
+        folder.mkdir(parents=True)
+        rows = [dict(step=step + late, eval_step=step, eval_return=1.0, phase="train")
+                for step in (5000, 10000)]
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    succeed("plot", *tmp_path.glob("*/*/*"), "--out", tmp_path / "curves.txt")  # always a PNG
+    found = json.loads((tmp_path / "curves.json").read_text())["a-b"]["diswm"]
+    assert (found["seeds"], found["steps"]) == (2, [5000, 10000])
+    check_picture(tmp_path / "curves.png")
 
 
 def test_plot_shows_returns_below_zero(tmp_path, monkeypatch):
@@ -3435,6 +3551,17 @@ def test_videos_in_fortran_order_or_of_both_kinds_are_learnt_from_as_they_are(tm
         if key in videos.dtype.names})
     np.testing.assert_array_equal(videos.window(4, 12)["image"], image)
     assert videos.rows == 16
+
+
+def test_a_video_that_changed_is_unpacked_again(tmp_path):
+    """The cache must not answer with what the file was."""
+    old = save_video(tmp_path / "a.npz")["image"]
+    diswm.open_videos(tmp_path, tmp_path / "cache")
+    save_video(tmp_path / "a.npz", image=255 - old)
+    later = time.time() + 10
+    os.utime(tmp_path / "a.npz", (later, later))
+    videos = diswm.open_videos(tmp_path, tmp_path / "cache")
+    np.testing.assert_array_equal(videos.window(0, len(old))["image"], 255 - old)
 
 
 @pytest.mark.parametrize("field, says", [
