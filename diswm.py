@@ -699,9 +699,9 @@ class Agent:
         code = self.teacher(preprocess(image))
         return {key: x.cpu().numpy() for key, x in zip(TEACHER, code, strict=True)}
 
-    def update(self, batch, eta, update, probe=False):
+    def update(self, batch, eta, update):
         """Algorithm 1, lines 12–18: one step of everything on numpy arrays (B, T, ...) → metrics.
-        update: index of this step. probe: measure distillation's own gradient at the encoder."""
+        update: index of this step; each 100, distillation's own gradient is measured too."""
         cfg, clip, batch = self.cfg, self.cfg.grad_clip, to_device(batch, self.device)
         with autocast(cfg):
             out = self.model(batch)
@@ -712,7 +712,7 @@ class Agent:
             # Kept beside the replay, which is right only as the teacher is frozen: 8 % of a step.
             teacher = latent_code(*(batch[key] for key in TEACHER)) if self.teacher else None
             loss, metrics = self.model.loss(out, batch, teacher, eta)
-        if probe and "distill" in metrics:
+        if update % 100 == 0 and "distill" in metrics:                        # at the encoder
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
             metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
@@ -793,14 +793,6 @@ def check_archive(path, limit):
         if size > limit or archive.testzip():
             raise ValueError(f"altered, or a bomb: it would unpack to {size:,} bytes")
 
-def save_rows(path, rows):
-    """Write an episode: an array that np.load opens, and behind it a checksum."""
-    buffer = io.BytesIO()
-    np.save(buffer, rows)
-    content = buffer.getvalue()
-    with atomic(path) as file:
-        file.write(content + struct.pack("<I", zlib.crc32(content)))
-
 class Replay:
     """Finished episodes, a file each, laid end to end; windows start uniformly anywhere.
         episodes    ┌──────── 0 ────────┐┌──── 1 ────┐┌─────── 2 ──────
@@ -842,11 +834,14 @@ class Replay:
     def add(self, rows, **more):
         """Append a finished episode, a list of `make_row`; the oldest beyond capacity go.
         more: fields that these do not have, arrays (T, ...)."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        path, episode = self.folder / f"{self.next_index:06d}.npy", np.empty(len(rows), self.dtype)
+        episode, buffer = np.empty(len(rows), self.dtype), io.BytesIO()
         for name in self.dtype.names:
             episode[name] = more[name] if name in more else [row[name] for row in rows]
-        save_rows(path, episode)
+        np.save(buffer, episode)
+        content, path = buffer.getvalue(), self.folder / f"{self.next_index:06d}.npy"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with atomic(path) as file:
+            file.write(content + struct.pack("<I", zlib.crc32(content)))
         self._hold([*self.episodes, (path, len(rows))])
         while self.capacity and self.rows - self.ends[0] >= self.capacity:
             self._hold(self.episodes[1:])
@@ -891,28 +886,23 @@ class Replay:
 def open_videos(folder, cache):
     """The episodes of a folder, *.npy of ours or anybody's *.npz, as a Replay of images. An .npz,
     the authors' are compressed, is unpacked into a folder of `cache`, once; not a zip bomb."""
-    paths = sorted(Path(folder).glob("*.np[yz]"))
+    paths = sorted(Path(folder).resolve().glob("*.np[yz]"))
     if not paths:
         raise UserError(f"no episodes (*.npy, *.npz) in {folder}; run: python diswm.py collect "
                         "--src TASK")
     if all(path.suffix == ".npy" for path in paths):
         return Replay(folder)
-    cache = cache / re.sub(r"\W", "_", str(Path(folder).resolve()))           # one for each folder
-    cache.mkdir(parents=True, exist_ok=True)
-    for path in paths:
-        unpacked = cache / f"{path.name}.npy"
-        if not unpacked.exists() or os.path.getmtime(unpacked) < os.path.getmtime(path):
-            with reading(path, "video", "remove it"):
-                if path.suffix == ".npz":
-                    check_archive(path, max(2**30, 100 * os.path.getsize(path)))
-                image = np.load(path, mmap_mode="r", allow_pickle=False)["image"]
-                if image.dtype != np.uint8 or image.shape != (len(image) or 1, 64, 64, 3):
-                    raise ValueError(f"image is {image.dtype} {image.shape}, "
-                                     "not uint8 (T, 64, 64, 3)")
-            rows = np.zeros(len(image), VIDEO)
-            rows["image"], rows["is_first"][0] = image, True
-            save_rows(unpacked, rows)
-    return Replay(cache)
+    stamp = zlib.crc32(repr([(path, os.path.getmtime(path)) for path in paths]).encode())
+    unpacked = Replay(cache / f"{stamp:08x}")                                 # of these very files
+    for path in paths[len(unpacked.paths):]:
+        with reading(path, "video", "remove it"):
+            if path.suffix == ".npz":
+                check_archive(path, max(2**30, 100 * os.path.getsize(path)))
+            image = np.load(path, mmap_mode="r", allow_pickle=False)["image"]
+            if image.dtype != np.uint8 or image.shape != (len(image) or 1, 64, 64, 3):
+                raise ValueError(f"image is {image.dtype} {image.shape}, not uint8 (T, 64, 64, 3)")
+        unpacked.add([dict(image=frame, is_first=t == 0) for t, frame in enumerate(image)])
+    return unpacked
 
 # === Environments =================================================================================
 
@@ -1248,6 +1238,16 @@ def read_checkpoint(path):
         int(state["trainer"]["progress"])
         return state | {key: state[key] for key in ("stage", "trainer", "rng", "log_bytes")}
 
+MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")  # this machine's, bytes
+
+def memory_needed(cfg):
+    """GB, as measured. Raises UserError where this machine has less."""
+    memory, have = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5, MEMORY / 1e9
+    if cfg.device == "cpu" and memory > have:
+        raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
+                        "take a smaller --batch-size, --batch-length or --cnn-depth")
+    return memory
+
 class Run:
     """A run's folder: checkpoint.pt, config.json, metrics.jsonl, TensorBoard events."""
     def __init__(self, cfg, stage, fresh=False):
@@ -1270,6 +1270,11 @@ class Run:
         if differ:
             raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the same "
                             "flags, or --fresh to start over, or another --runs")
+        frames = 0 if stage == "pretrain" else cfg.steps // cfg.action_repeat
+        disk, memory = 0.1 + frames * 12.35e-6, memory_needed(cfg)            # GB; a row is 12.3 kB
+        print(f"{stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
+              f"{cfg.precision} and {torch.get_num_threads()} threads\n  needs about {disk:.1f} GB "
+              f"of disk and {memory:.1f} GB of memory; results go to {self.folder}", flush=True)
 
     def clear(self, videos=None):
         """What --fresh replaces goes, late: nothing is lost to a mistake in the command."""
@@ -1427,52 +1432,46 @@ class AgentTrainer(Trainer):
         self.total, self.switch_step = cfg.steps, int(cfg.switch * cfg.steps)
 
     def learn(self, env_steps):
-        """The updates due after a decision in each environment that plays → list of metrics."""
-        cfg, before, metrics = self.cfg, self.decisions, []
+        """The updates due after a decision in each environment that plays → is the phase over?"""
+        cfg, before = self.cfg, self.decisions
         self.decisions += len(env_steps)
         self.progress += int(env_steps.sum())
-        if self.decisions < cfg.prefill or self.replay.rows < cfg.batch_length:
-            return metrics
+        ready = self.decisions >= cfg.prefill and self.replay.rows >= cfg.batch_length
         due = self.decisions // cfg.train_every - before // cfg.train_every
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
-        for _ in range(due if self.updates else cfg.first_updates):
+        for _ in range(ready and (due if self.updates else cfg.first_updates)):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             self.batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
-            probe = self.updates % 100 == 0
-            update = self.agent.update(self.batch, eta, self.updates, probe)
-            metrics.append(check_finite(update))
+            self.metrics.append(check_finite(self.agent.update(self.batch, eta, self.updates)))
             self.updates += 1
-        return metrics
+        return self.progress >= self.limit
 
     def play(self):
-        """An episode in each environment, learning on the way → see play_episodes, and the metrics
-        of the updates. It ends with the simulator's, at the colour switch, or with the run."""
-        cfg, metrics, count = self.cfg, [], self.envs.num_envs
+        """An episode in each environment, learning on the way → see play_episodes.
+        It ends with the simulator's, at the colour switch, or with the run."""
+        cfg, self.metrics, count = self.cfg, [], self.envs.num_envs
         seeds = [episode_seed(cfg.seed, TRAINING, self.episodes + i) for i in range(count)]
         random, actor = random_policy(seeds), functools.partial(self.agent.act, explore=True)
-        self.phase, limit = "shifted", self.total
+        self.phase, self.limit = "shifted", self.total
         if self.progress < self.switch_step:  # the colours switch once, at the midpoint
-            self.phase, limit = "train", self.switch_step
+            self.phase, self.limit = "train", self.switch_step
         def policy(*args):
             return (random if self.decisions < cfg.prefill else actor)(*args)
-        def each(env_steps):
-            metrics.extend(self.learn(env_steps))
-            return self.progress >= limit
-        return play_episodes(self.envs, policy, seeds, self.phase, each), metrics
+        return play_episodes(self.envs, policy, seeds, self.phase, self.learn)
 
     def advance(self):
         """An episode in each environment, and an evaluation when one is due → a row of the log."""
         cfg, start = self.cfg, self.progress
         self.replay.prune()           # a checkpoint was written: what only the one before needed
-        episodes, metrics = self.play()
+        episodes = self.play()
         self.episodes += len(episodes)
         rows, returns, success = zip(*episodes, strict=True)
         for episode in rows:
             self.replay.add(episode, **self.agent.taught(episode))
         row = dict(step=self.progress, phase=self.phase, train_return=statistics.fmean(returns),
                    train_length=statistics.mean(len(episode) - 1 for episode in rows))
-        row |= mean_metrics(metrics) | {name: getattr(self, name) for name in self.counters[1:]}
+        row |= mean_metrics(self.metrics) | {key: getattr(self, key) for key in self.counters[1:]}
         row |= {} if None in success else dict(train_success=statistics.fmean(success))
         due = self.progress - self.progress % cfg.eval_every
         if self.progress >= self.total or due > start:
@@ -1511,24 +1510,6 @@ def evaluate_agent(cfg, agent, envs, phase, replay=None):
     return result if None in success else result | dict(success=statistics.fmean(success))
 
 # === Stages =======================================================================================
-
-MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")  # this machine's, bytes
-
-def memory_needed(cfg):
-    """GB, as measured. Raises UserError where this machine has less."""
-    memory, have = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5, MEMORY / 1e9
-    if cfg.device == "cpu" and memory > have:
-        raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
-                        "take a smaller --batch-size, --batch-length or --cnn-depth")
-    return memory
-
-def announce(run, frames):
-    """Say what runs, on what, its needs and folder."""
-    cfg, disk = run.cfg, 0.1 + frames * 12.35e-6                              # GB; a row is 12.3 kB
-    memory = memory_needed(cfg)
-    print(f"{run.stage} {cfg.method}, {cfg.src} → {cfg.dst}, seed {cfg.seed}, on {cfg.device} with "
-          f"{cfg.precision} and {torch.get_num_threads()} threads\n  needs about {disk:.1f} GB of "
-          f"disk and {memory:.1f} GB of memory; results go to {run.folder}", flush=True)
 
 def load_model(path, device):
     """The model of a checkpoint → (its cfg on `device`, Agent or VideoPredictor, the checkpoint)"""
@@ -1605,7 +1586,6 @@ def pretrain(cfg, fresh=False):
         raise UserError(f"{folder} has {videos.rows} frames, less than one window of "
                         f"{cfg.batch_length}; collect more, or lower --batch-length")
     print(f"videos: {folder}, {len(videos.paths):,} episodes, {videos.rows:,} frames")
-    announce(run, 0)
     if fresh:
         run.clear(videos.folder)
     torch.manual_seed(initial_seed(cfg, VideoPredictor))
@@ -1620,7 +1600,6 @@ def finetune(cfg, fresh=False, stage="finetune"):
     elif cfg.eta > 0 or cfg.carry_over != "none":
         video = find_teacher(cfg, device)
         teacher = freeze(video.encoder) if cfg.eta > 0 else None
-    announce(run, cfg.steps // cfg.action_repeat)
     if fresh:
         run.clear()
     torch.manual_seed(initial_seed(cfg, WorldModel))
@@ -1889,38 +1868,29 @@ def plot(cfg, folders, path):
 
 # === Doctor and bench =============================================================================
 
+FAMILIES = ("walker_walk", "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5")
+
 def machine(cfg):
     """What runs here, and on what."""
     versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
     return dict(device=cfg.device, precision=cfg.precision, threads=torch.get_num_threads(),
                 gl=os.environ["MUJOCO_GL"], versions=versions | dict(python=sys.version.split()[0]))
 
-def show(result):
-    """Print a dict of dicts, a line for each value."""
-    for name, value in result.items():
-        for part, number in value.items() if isinstance(value, dict) else [("", value)]:
-            print(f"{f'{name} {part}':30}", f"{number:.4g}" if type(number) is float else number)
-
-def family_tasks(cfg):
-    """A task of each family."""
-    dmc = cfg.dst if cfg.dst in TASKS else "walker_walk"
-    return dmc, "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5"
-
 def doctor(cfg):
     """Check rendering and versions.
     doctor.png: a frame of each family in each phase. Raises UserError, last, if one fails."""
-    show(machine(cfg))
-    tasks, failed, path = family_tasks(cfg), [], Path(cfg.runs) / "doctor.png"
+    print(json.dumps(machine(cfg), indent=2))
+    failed, path = [], Path(cfg.runs) / "doctor.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    pictures = np.full((len(tasks), len(PHASES), 64, 64, 3), 128, np.uint8)   # grey: has failed
-    for row, task in zip(pictures, tasks, strict=True):
+    pictures = np.full((len(FAMILIES), len(PHASES), 64, 64, 3), 128, np.uint8)  # grey: has failed
+    for row, task in zip(pictures, FAMILIES, strict=True):
         try:
             with config_env(cfg, task, "none") as env:
                 row[:] = [env.reset(seed=cfg.seed, options=dict(phase=p))[0] for p in PHASES]
         except UserError as error:
             print(f"{task}: {error}")
             failed.append(task)
-    draw_grid(pictures, tasks, PHASES, path)
+    draw_grid(pictures, FAMILIES, PHASES, path)
     if failed:
         raise UserError(f"{', '.join(failed)} cannot be rendered; the causes stand above")
 
@@ -1960,14 +1930,14 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
     parts = dict(agent.behaviour.named_children(), world_model=agent.model, teacher=teacher)
     counts = {name: sum(p.numel() for p in m.parameters()) for name, m in parts.items() if m}
     result |= dict(params=counts | dict(total=sum(counts.values())), frame_ms={}, decision_ms={})
-    for task in family_tasks(cfg):
+    for task in FAMILIES:
         with config_env(cfg, task, "train") as env:
             agent = Agent(cfg, *env.action_space.shape, device, teacher)
             seen = env.render()[None], np.zeros((1, agent.action_dim), np.float32), None
             result["frame_ms"][task] = 1e3 * median_s(env.render, 50)
             result["decision_ms"][task] = 1e3 * median_s(
                 lambda env=env, agent=agent, seen=seen: env.step(agent.act(*seen, True)[0][0]), 50)
-    print(json.dumps(result)) if as_json else show(result)
+    print(json.dumps(result, indent=None if as_json else 2))
 
 # === Command line =================================================================================
 

@@ -27,6 +27,7 @@ import threading
 import time
 import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import gymnasium as gym
@@ -1377,7 +1378,7 @@ def test_replay_rows_align_image_with_the_action_and_reward_that_led_to_it(
     with tempfile.TemporaryDirectory() as folder:
         trainer = counting_trainer(cfg, folder, length, terminates)
         for _ in range(2):
-            trainer.replay.add(trainer.play()[0][0][0])
+            trainer.replay.add(trainer.play()[0][0])
         rows = trainer.replay.window(0, trainer.replay.rows)
     assert trainer.updates > 0  # the agent, not only prefill, has acted
     per_episode = -(-length // repeat) + 1
@@ -1730,7 +1731,7 @@ def test_parallel_envs_fill_the_replay_like_as_many_single_ones(tmp_path):
         trainer = AgentTrainer(vector_config(envs), tmp_path / str(envs), CPU)
         with contextlib.closing(trainer.envs):
             for _ in range(4 // envs):
-                for rows, *_ in trainer.play()[0]:
+                for rows, *_ in trainer.play():
                     trainer.replay.add(rows)
                     trainer.episodes += 1
         assert (trainer.progress, trainer.decisions) == (48, 24)
@@ -1762,7 +1763,7 @@ def test_parallel_episodes_end_one_by_one_and_updates_count_decisions(seed, ever
         trainer.updates = 1
         trainer.agent.update = lambda *args: updates.append(trainer.decisions) or dict(
             loss=torch.zeros(()))
-        episodes, _ = trainer.play()
+        episodes = trainer.play()
     lengths = [4 + s % 4 for s in seeds]
     assert [len(rows) - 1 for rows, *_ in episodes] == lengths
     assert [rows[-1]["is_terminal"] for rows, *_ in episodes] == [True] * count
@@ -1813,7 +1814,7 @@ def play_on(trainer, episodes=99):
     seen = []
     while trainer.progress < trainer.total and len(seen) < episodes:
         start = trainer.progress
-        trainer.replay.add(trainer.play()[0][0][0])
+        trainer.replay.add(trainer.play()[0][0])
         trainer.episodes += 1
         env, = trainer.envs.envs
         seen.append((start, env.get_wrapper_attr("phase"), materials(env).mean(0)))
@@ -2082,7 +2083,7 @@ def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
         act = trainer.agent.act
         trainer.agent.act = lambda *args, **kwargs: (
             acted.append(trainer.decisions) or act(*args, **kwargs))
-        trainer.agent.update = lambda batch, eta, update, probe=False: calls.append(
+        trainer.agent.update = lambda batch, eta, update: calls.append(
             (trainer.decisions, update, eta)) or dict(
                 loss=torch.zeros(()))
         play_on_counting(trainer)
@@ -2100,7 +2101,7 @@ def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
 def play_on_counting(trainer):
     """Play a CountingEnv trainer to its end."""
     while trainer.progress < trainer.total:
-        trainer.replay.add(trainer.play()[0][0][0])
+        trainer.replay.add(trainer.play()[0][0])
         trainer.episodes += 1
 
 
@@ -2602,9 +2603,10 @@ def test_bench_reports_times_memory_and_parameters_as_one_json_object():
 
 
 def test_bench_prints_the_same_for_people():
-    """Without --json, a line for each value."""
+    """Without --json, a line for each value, indented."""
     out = succeed("bench", "--repeats", 0, *DEBUG)  # at least one
-    assert "train_step_s" in out and "params total" in out and "batch_size_scaling" not in out
+    assert '\n  "train_step_s": ' in out and '\n    "total": ' in out
+    assert "batch_size_scaling" not in out
 
 
 def test_bf16_steps_like_fp32():
@@ -3685,6 +3687,13 @@ def test_nan_gradient_of_a_finite_loss_stops_the_run(teacher, uncut, tmp_path):
     assert_identical(everything(tmp_path / FINETUNED), uncut)
 
 
+def save_rows(path, rows):
+    """An episode as Replay.add writes it: an array and its checksum."""
+    buffer = io.BytesIO()
+    np.save(buffer, rows)
+    path.write_bytes(buffer.getvalue() + zlib.crc32(buffer.getvalue()).to_bytes(4, "little"))
+
+
 def test_nan_in_a_stored_reward_is_named_and_its_batch_kept(teacher, tmp_path):
     """As a faulty simulator leaves it: the message says reward, the dump shows the row."""
     argv, run = cut_command(teacher, tmp_path), tmp_path / FINETUNED
@@ -3692,7 +3701,7 @@ def test_nan_in_a_stored_reward_is_named_and_its_batch_kept(teacher, tmp_path):
     for path in (run / "episodes").glob("*.npy"):
         episode = np.load(path)
         episode["reward"] *= np.nan
-        diswm.save_rows(path, episode)
+        save_rows(path, episode)
     refuse(*argv, says=("non-finite", "reward", "nonfinite.npz"))
     with np.load(run / "nonfinite.npz") as batch:
         assert np.isnan(batch["reward"]).any()
@@ -3700,9 +3709,9 @@ def test_nan_in_a_stored_reward_is_named_and_its_batch_kept(teacher, tmp_path):
 
 LOG_VALUES = (st.none() | st.booleans() | st.integers(-10, 10**400) | st.floats()
               | st.text(max_size=3) | st.lists(st.integers(0, 9), max_size=2))
-LOG_ROWS = st.dictionaries(st.sampled_from(["step", "update", "eval_return", "phase", "x"]),
-                           LOG_VALUES) | LOG_VALUES | st.just({
-                               "step": 10, "phase": "train", "eval_return": 1.5})
+LOG_NAMES = st.sampled_from(["step", "update", "eval_return", "eval_step", "phase", "x"])
+LOG_ROWS = st.dictionaries(LOG_NAMES, LOG_VALUES) | LOG_VALUES | st.just({
+    "step": 10, "phase": "train", "eval_return": 1.5})
 
 
 @settings(max_examples=60)
