@@ -1276,10 +1276,9 @@ class Run:
               f"{cfg.precision} and {torch.get_num_threads()} threads\n  needs about {disk:.1f} GB "
               f"of disk and {memory:.1f} GB of memory; results go to {self.folder}", flush=True)
 
-    def clear(self, videos=None):
+    def clear(self):
         """What --fresh replaces goes, late: nothing is lost to a mistake in the command."""
-        kept = {self.folder / "lock", self.folder / "videos", videos}
-        for path in {*self.folder.iterdir(), *self.folder.glob("videos/*")} - kept:
+        for path in set(self.folder.iterdir()) - {self.folder / "lock", self.folder / "videos"}:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def save(self, trainer):
@@ -1436,11 +1435,14 @@ class AgentTrainer(Trainer):
         cfg, before = self.cfg, self.decisions
         self.decisions += len(env_steps)
         self.progress += int(env_steps.sum())
-        ready = self.decisions >= cfg.prefill and self.replay.rows >= cfg.batch_length
         due = self.decisions // cfg.train_every - before // cfg.train_every
+        if self.decisions < cfg.prefill or self.replay.rows < cfg.batch_length:
+            due = 0
+        elif not self.updates:
+            due = cfg.first_updates
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
-        for _ in range(ready and (due if self.updates else cfg.first_updates)):
+        for _ in range(due):
             rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
             self.batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
             self.metrics.append(check_finite(self.agent.update(self.batch, eta, self.updates)))
@@ -1586,8 +1588,10 @@ def pretrain(cfg, fresh=False):
         raise UserError(f"{folder} has {videos.rows} frames, less than one window of "
                         f"{cfg.batch_length}; collect more, or lower --batch-length")
     print(f"videos: {folder}, {len(videos.paths):,} episodes, {videos.rows:,} frames")
+    for stale in set((run.folder / "videos").glob("*")) - {videos.folder}:    # as files changed
+        shutil.rmtree(stale)
     if fresh:
-        run.clear(videos.folder)
+        run.clear()
     torch.manual_seed(initial_seed(cfg, VideoPredictor))
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
