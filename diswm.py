@@ -45,7 +45,6 @@ import re
 import resource
 import shutil
 import signal
-import statistics
 import struct
 import sys
 import tempfile
@@ -666,15 +665,34 @@ def check_finite(metrics):
         raise FloatingPointError(f"non-finite {', '.join(bad[:3])}")
     return metrics
 
-class Agent:
+class Saved:
+    """What a checkpoint holds of an object: `parts`, which do so themselves, and `counters`."""
+    def state_dict(self):
+        parts = {name: getattr(self, name).state_dict() for name in self.parts}
+        return parts | {name: getattr(self, name) for name in self.counters}
+
+    def load_state_dict(self, state):
+        for name in self.parts:
+            getattr(self, name).load_state_dict(state[name])
+        for name in self.counters:
+            if type(state[name]) is not type(getattr(self, name)):
+                raise TypeError(f"{name} is {state[name]}")
+            setattr(self, name, state[name])
+
+class Agent(Saved):
     """World model, actor-critic, frozen teacher and optimisers: what an online run trains."""
+    parts = ("model", "behaviour", "model_adam", "actor_adam", "critic_adam")
+    counters = ("action_dim",)
+
     def __init__(self, cfg, action_dim, device, teacher=None):
         self.cfg, self.action_dim, self.device, self.teacher = cfg, action_dim, device, teacher
         self.model = WorldModel(cfg, padded_actions(cfg, action_dim)).to(device)
         self.behaviour = ActorCritic(cfg, action_dim).to(device)
-        self.optimizers = dict(model=Adam(self.model, cfg.model_lr),
-                               actor=Adam(self.behaviour.actor, cfg.actor_lr),
-                               critic=Adam(self.behaviour.critic, cfg.critic_lr))
+        self.model_adam = Adam(self.model, cfg.model_lr)
+        self.actor_adam = Adam(self.behaviour.actor, cfg.actor_lr)
+        self.critic_adam = Adam(self.behaviour.critic, cfg.critic_lr)
+        if teacher:
+            self.parts += ("teacher",)                    # a run needs no other file to go on
         if cfg.compile:
             self.behaviour.imagine = torch.compile(self.behaviour.imagine)
 
@@ -716,7 +734,7 @@ class Agent:
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
             metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
-        metrics["model_grad_norm"] = gradient_step(self.optimizers["model"], loss, clip)
+        metrics["model_grad_norm"] = gradient_step(self.model_adam, loss, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
         start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}  # data here
@@ -725,21 +743,11 @@ class Agent:
             chosen = torch.randperm(len(start["discount"]), device=self.device)[:cfg.imagine_starts]
             start = {key: value[chosen] for key, value in start.items()}
         with autocast(cfg):
-            *losses, more = self.behaviour.losses(self.model, start, start.pop("discount"))
+            actor, critic, more = self.behaviour.losses(self.model, start, start.pop("discount"))
         metrics |= more
-        for name, loss in zip(("actor", "critic"), losses, strict=True):
-            metrics[f"{name}_grad_norm"] = gradient_step(self.optimizers[name], loss, clip)
+        metrics["actor_grad_norm"] = gradient_step(self.actor_adam, actor, clip)
+        metrics["critic_grad_norm"] = gradient_step(self.critic_adam, critic, clip)
         return {key: value.detach() for key, value in metrics.items()}
-
-    def state_dict(self):
-        return dict(model=self.model.state_dict(), behaviour=self.behaviour.state_dict(),
-                    optimizers={name: opt.state_dict() for name, opt in self.optimizers.items()})
-
-    def load_state_dict(self, state):
-        self.model.load_state_dict(state["model"])
-        self.behaviour.load_state_dict(state["behaviour"])
-        for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(state["optimizers"][name])
 
 # === Replay and video sets: episodes on disk ======================================================
 
@@ -759,13 +767,12 @@ def make_row(image, action, reward=0.0, terminal=False, first=False):
     return dict(image=image, action=action, reward=reward, discount=1.0 - terminal, is_first=first,
                 is_terminal=terminal)
 
-@contextlib.contextmanager
-def atomic(path):
-    """Yield a binary file that takes its place whole, when the block ends well, or not at all."""
+def write_whole(path, content):
+    """Write a file's bytes, all of them or, if that fails, none."""
     temporary = path.with_name(path.name + ".tmp")
     try:
         with open(temporary, "wb") as file:
-            yield file
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -840,8 +847,7 @@ class Replay:
         np.save(buffer, episode)
         content, path = buffer.getvalue(), self.folder / f"{self.next_index:06d}.npy"
         self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic(path) as file:
-            file.write(content + struct.pack("<I", zlib.crc32(content)))
+        write_whole(path, content + struct.pack("<I", zlib.crc32(content)))
         self._hold([*self.episodes, (path, len(rows))])
         while self.capacity and self.rows - self.ends[0] >= self.capacity:
             self._hold(self.episodes[1:])
@@ -1236,7 +1242,8 @@ def read_checkpoint(path):
         if not all(x.dtype in (torch.float32, torch.int64) and x.isfinite().all() for x in tensors):
             raise ValueError("not all weights are finite float32")
         int(state["trainer"]["progress"])
-        return state | {key: state[key] for key in ("stage", "trainer", "rng", "log_bytes")}
+        state["log"].encode()
+        return {key: state[key] for key in ("config", "stage", "trainer", "log")}
 
 MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")  # this machine's, bytes
 
@@ -1255,7 +1262,6 @@ class Run:
             cfg = replace(cfg, eta_delay=cfg.eta_decay * (family(cfg.src) != family(cfg.dst)))
         self.cfg, self.stage, self.folder = cfg, stage, run_folder(cfg, stage)
         self.checkpoint = self.folder / "checkpoint.pt"
-        self.log_path = self.folder / "metrics.jsonl"
         self.folder.mkdir(parents=True, exist_ok=True)
         self.lock = open(self.folder / "lock", "w")  # noqa: SIM115, train() closes it
         try:
@@ -1264,6 +1270,7 @@ class Run:
             raise UserError(f"another process is at work in {self.folder}; stop it first") from None
         whole = self.checkpoint.exists() and not fresh
         self.state = read_checkpoint(self.checkpoint) if whole else None
+        self.log = self.state["log"] if self.state else ""
         old, new = vars(self.state["config"] if self.state else cfg), vars(cfg)
         differ = [f"{f.name} {old[f.name]} (now {new[f.name]})" for f in dataclasses.fields(cfg)
                   if old[f.name] != new[f.name] and not f.metadata["free"]]
@@ -1282,28 +1289,13 @@ class Run:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def save(self, trainer):
-        """Write the checkpoint, whole or not at all."""
-        cuda = torch.cuda.get_rng_state() if self.cfg.device == "cuda" else None
-        size = self.log_path.stat().st_size if self.log_path.exists() else 0
+        """Write config and log, for people, and the checkpoint, which holds them too."""
         buffer = io.BytesIO()  # a full disk is then an OSError of the file, not one inside torch
         torch.save(dict(config=vars(self.cfg), stage=self.stage, trainer=trainer.state_dict(),
-                        rng=dict(cpu=torch.get_rng_state(), cuda=cuda), log_bytes=size), buffer)
-        with atomic(self.folder / "config.json") as file:
-            file.write(json.dumps(vars(self.cfg), indent=2).encode())
-        with atomic(self.checkpoint) as file:
-            file.write(buffer.getbuffer())
-
-    def restore(self, trainer):
-        """Trainer, random numbers, and the log as it was then."""
-        with reading(self.checkpoint):
-            trainer.load_state_dict(self.state["trainer"])
-            torch.set_rng_state(self.state["rng"]["cpu"])
-            if self.state["rng"]["cuda"] is not None and self.cfg.device == "cuda":
-                torch.cuda.set_rng_state(self.state["rng"]["cuda"])
-            if self.log_path.exists():
-                if not 0 <= self.state["log_bytes"] <= self.log_path.stat().st_size:
-                    raise ValueError(f"{self.log_path.name} is shorter than it was then")
-                os.truncate(self.log_path, self.state["log_bytes"])          # the rest comes again
+                        log=self.log), buffer)
+        write_whole(self.folder / "config.json", json.dumps(vars(self.cfg), indent=2).encode())
+        write_whole(self.folder / "metrics.jsonl", self.log.encode())
+        write_whole(self.checkpoint, buffer.getbuffer())
 
 @contextlib.contextmanager
 def stop_requests():
@@ -1322,10 +1314,12 @@ def stop_requests():
         yield received
 
 def train(trainer, run):
-    """The one training loop: resume; then work, log, checkpoint, until the Trainer's total."""
+    """The one training loop: resume; then work, log, checkpoint, from `progress` to `total` in
+    `unit`s. trainer.advance() does some → a row of the log or None; `batch`: the latest."""
     from torch.utils.tensorboard import SummaryWriter  # slow to import
     if run.state:
-        run.restore(trainer)
+        with reading(run.checkpoint):
+            trainer.load_state_dict(run.state["trainer"])
         print(f"resuming at {trainer.progress:,} of {trainer.total:,} {trainer.unit}", flush=True)
     else:
         run.save(trainer)
@@ -1344,10 +1338,7 @@ def train(trainer, run):
             if row:
                 seconds = time.time() - began
                 row |= dict(seconds=seconds, rate=(trainer.progress - first) / seconds)
-                with open(run.log_path, "a") as file:
-                    file.write(json.dumps(row) + "\n")
-                    file.flush()
-                    os.fsync(file)                       # before the checkpoint that counts on it
+                run.log += json.dumps(row) + "\n"
                 for key, value in row.items():
                     if isinstance(value, (int, float)):
                         writer.add_scalar(key, value, trainer.progress)
@@ -1367,24 +1358,9 @@ def train(trainer, run):
 def mean_metrics(rows):
     """The average of several updates' metrics: list of dicts of scalars → dict of floats."""
     names = sorted({name for row in rows for name in row})
-    return {name: statistics.fmean(row[name] for row in rows if name in row) for name in names}
+    return {name: np.mean([row[name] for row in rows if name in row]) for name in names}
 
-class Trainer:
-    """Work for train(): `progress` to `total` in `unit`s; advance() does some → a row of metrics or
-    None. What changes: `parts` that have a state_dict, and `counters`; `batch`: the latest."""
-    def state_dict(self):
-        parts = {name: getattr(self, name).state_dict() for name in self.parts}
-        return parts | {name: getattr(self, name) for name in self.counters}
-
-    def load_state_dict(self, state):
-        for name in self.parts:
-            getattr(self, name).load_state_dict(state[name])
-        for name in self.counters:
-            if type(state[name]) is not type(getattr(self, name)):
-                raise TypeError(f"{name} is {state[name]}")
-            setattr(self, name, state[name])
-
-class VideoTrainer(Trainer):
+class VideoTrainer(Saved):
     """Stage 2, Algorithm 1 lines 4–8: the video predictor. Progress is in updates."""
     unit, shown, parts = "updates", ("image", "kl", "disentangle"), ("model", "optimizer")
     counters, chunk = ("progress", "metrics"), 100                            # updates per log row
@@ -1405,7 +1381,8 @@ class VideoTrainer(Trainer):
 
     def advance(self):
         """An update → after every `chunk` of them, and at the end, a row of the log."""
-        cfg, rng = self.cfg, np.random.default_rng([self.cfg.seed, self.progress])  # not saved
+        cfg, rng = self.cfg, np.random.default_rng([self.cfg.seed, self.progress])
+        torch.manual_seed(rng.integers(2**63))            # so there is no random state to save
         self.batch = self.videos.sample(cfg.batch_size, cfg.batch_length, rng)
         self.metrics.append(check_finite(self.update(self.batch)))
         self.progress += 1
@@ -1414,7 +1391,7 @@ class VideoTrainer(Trainer):
         row, self.metrics = dict(update=self.progress) | mean_metrics(self.metrics), []
         return row
 
-class AgentTrainer(Trainer):
+class AgentTrainer(Saved):
     """Stages 1 and 3, Algorithm 1 lines 9–25: an agent in an environment. Progress in env steps.
     It works episode by episode. A checkpoint falls between two of them, so no simulator or
     recurrent state is in it; the colours, η and all seeds follow from the counters."""
@@ -1443,7 +1420,7 @@ class AgentTrainer(Trainer):
         # DEVIATION: η follows the live clock; the published one is copied once and never anneals.
         eta = eta_schedule(self.decisions, cfg.eta, cfg.eta_end, cfg.eta_decay, cfg.eta_delay)
         for _ in range(due):
-            rng = np.random.default_rng([cfg.seed, self.updates])             # nothing to save
+            rng = np.random.default_rng([cfg.seed, self.updates])
             self.batch = self.replay.sample(cfg.batch_size, cfg.batch_length, rng)
             self.metrics.append(check_finite(self.agent.update(self.batch, eta, self.updates)))
             self.updates += 1
@@ -1454,6 +1431,7 @@ class AgentTrainer(Trainer):
         It ends with the simulator's, at the colour switch, or with the run."""
         cfg, self.metrics, count = self.cfg, [], self.envs.num_envs
         seeds = [episode_seed(cfg.seed, TRAINING, self.episodes + i) for i in range(count)]
+        torch.manual_seed(seeds[0])  # of all noise until the next: no random state to save
         random, actor = random_policy(seeds), functools.partial(self.agent.act, explore=True)
         self.phase, self.limit = "shifted", self.total
         if self.progress < self.switch_step:  # the colours switch once, at the midpoint
@@ -1471,45 +1449,35 @@ class AgentTrainer(Trainer):
         rows, returns, success = zip(*episodes, strict=True)
         for episode in rows:
             self.replay.add(episode, **self.agent.taught(episode))
-        row = dict(step=self.progress, phase=self.phase, train_return=statistics.fmean(returns),
-                   train_length=statistics.mean(len(episode) - 1 for episode in rows))
+        row = dict(step=self.progress, phase=self.phase, train_return=np.mean(returns),
+                   train_length=np.mean([len(episode) - 1 for episode in rows]))
         row |= mean_metrics(self.metrics) | {key: getattr(self, key) for key in self.counters[1:]}
-        row |= {} if None in success else dict(train_success=statistics.fmean(success))
+        row |= {} if None in success else dict(train_success=np.mean(success))
         due = self.progress - self.progress % cfg.eval_every
         if self.progress >= self.total or due > start:
-            result = evaluate_agent(cfg, self.agent, self.envs, judged_phase(cfg, self.phase))
+            result = evaluate_agent(cfg, self.agent, self.envs, self.phase)
             row["eval_return"] = result.pop("mean")
             row["eval_step"] = self.total if self.progress >= self.total else due
             row |= {f"eval_{key}": value for key, value in result.items()}
         return row
 
-    def state_dict(self):
-        """And the teacher, so that the run needs no other file."""
-        net = self.agent.teacher
-        saved = dict(depth=net.net[0].out_channels, weights=net.state_dict()) if net else None
-        return super().state_dict() | dict(teacher=saved, action_dim=self.agent.action_dim)
-
-def judged_phase(cfg, phase):
-    """What is evaluated in a phase of training: a drawer's third table top is never trained on."""
-    return "eval" if family(cfg.dst) == "drawer" else phase
-
 def evaluate_agent(cfg, agent, envs, phase, replay=None):
     """Play `eval_episodes` episodes into the replay, the same seeds every time; agent None: random.
-    Returns mean, list and standard deviation of their returns and, where the task tells, the share
-    that succeeded. Training's random numbers stay untouched."""
+    Returns their phase, training's but for drawers' table top that is never trained on; mean, list
+    and standard deviation of their returns and, where the task tells, the share that succeeded."""
     played, count = [], envs.num_envs
-    with torch.random.fork_rng():
-        torch.manual_seed(cfg.seed)
-        for first in range(0, cfg.eval_episodes, count):
-            seeds = [episode_seed(cfg.seed, EVALUATION, first + i) for i in range(count)]
-            policy = functools.partial(agent.act, explore=False) if agent else random_policy(seeds)
-            episodes = play_episodes(envs, policy, seeds, phase)[:cfg.eval_episodes - first]
-            played += [result for _, *result in episodes]
-            for rows, *_ in episodes if replay else ():
-                replay.add(rows)
+    phase = "eval" if family(cfg.dst) == "drawer" else phase
+    torch.manual_seed(cfg.seed)
+    for first in range(0, cfg.eval_episodes, count):
+        seeds = [episode_seed(cfg.seed, EVALUATION, first + i) for i in range(count)]
+        policy = functools.partial(agent.act, explore=False) if agent else random_policy(seeds)
+        episodes = play_episodes(envs, policy, seeds, phase)[:cfg.eval_episodes - first]
+        played += [result for _, *result in episodes]
+        for rows, *_ in episodes if replay else ():
+            replay.add(rows)
     returns, success = ([*column] for column in zip(*played, strict=True))
-    result = dict(mean=statistics.fmean(returns), returns=returns, std=statistics.pstdev(returns))
-    return result if None in success else result | dict(success=statistics.fmean(success))
+    result = dict(phase=phase, mean=np.mean(returns), returns=returns, std=np.std(returns))
+    return result if None in success else result | dict(success=np.mean(success))
 
 # === Stages =======================================================================================
 
@@ -1522,10 +1490,10 @@ def load_model(path, device):
         if state["stage"] == "pretrain":
             model, weights = VideoPredictor(cfg).to(device), trainer["model"]
         else:
-            teacher = trainer["teacher"] and BetaVAEEncoder(cfg.z_dim, trainer["teacher"]["depth"])
-            if teacher:
-                freeze(teacher.to(device)).load_state_dict(trainer["teacher"]["weights"])
-            model, weights = Agent(cfg, trainer["action_dim"], device, teacher), trainer["agent"]
+            weights = trainer["agent"]
+            depth = len(weights["teacher"]["net.0.bias"]) if "teacher" in weights else 0
+            teacher = freeze(BetaVAEEncoder(cfg.z_dim, depth).to(device)) if depth else None
+            model = Agent(cfg, weights["action_dim"], device, teacher)
         model.load_state_dict(weights)
     return cfg, model, state
 
@@ -1592,6 +1560,9 @@ def pretrain(cfg, fresh=False):
         shutil.rmtree(stale)
     if fresh:
         run.clear()
+    seen = Replay(run.folder / "episodes")                                    # for traverse
+    if not seen.paths:
+        seen.add(videos.read(videos.paths[-1]))
     torch.manual_seed(initial_seed(cfg, VideoPredictor))
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
@@ -1622,8 +1593,7 @@ def evaluate(cfg, folder):
     if not isinstance(agent, Agent):
         raise UserError(f"{folder} is a video predictor without a policy; give a finetune run")
     switched = cfg.steps > int(cfg.switch * cfg.steps) < step                 # as while it trained
-    phase = judged_phase(cfg, "shifted" if switched else "train")
-    result = dict(task=cfg.dst, phase=phase, step=step)
+    phase, result = "shifted" if switched else "train", dict(task=cfg.dst, step=step)
     shutil.rmtree(folder / "evaluation", ignore_errors=True)
     replay, said = Replay(folder / "evaluation", row_type(agent.action_dim)), []
     for name, policy in (("", agent), ("random_", None)):                  # which need not see
@@ -1638,7 +1608,7 @@ def evaluate(cfg, folder):
     frames = replay.window(0, replay.ends[0])["image"].repeat(4, 1).repeat(4, 2)
     iio.imwrite(folder / "evaluation.mp4", frames, fps=25)                    # 256 × 256
     (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
-    print(f"{cfg.dst}, {phase} colours, after {step:,} env steps: return {said[0]}; "
+    print(f"{cfg.dst}, {result['phase']} colours, after {step:,} env steps: return {said[0]}; "
           f"random policy: {said[1]}; {cfg.eval_episodes} episodes each\n"
           f"wrote evaluation.json, evaluation.mp4 and evaluation/*.npy in {folder}")
 
@@ -1758,25 +1728,17 @@ def draw_grid(pictures, rows, columns, path, title=""):
     print(f"wrote {path}")
 
 def traverse(cfg, folder, metrics=False):
-    """Draw latent traversals and open-loop predictions of a run.
-    Episodes: an agent's own; a predictor's --videos, else its own, else those collected beside it:
-    none that a checkpoint, maybe a stranger's, could name."""
-    videos, device = cfg.videos, torch.device(cfg.device)
+    """Draw latent traversals and open-loop predictions of a run, from the last of its episodes."""
+    device, fields, teacher = torch.device(cfg.device), VIDEO, None
     cfg, model, _ = load_model(folder / "checkpoint.pt", device)
     if isinstance(model, Agent):
-        replay = Replay(folder / "episodes", row_type(model.action_dim))
-        teacher, model = model.teacher, model.model
-    else:
-        source = folder.resolve().parent.parent.name
-        places = [*(folder / "videos").glob("*"),
-                  *folder.glob(f"../../../../collect/{source}/*/seed*/episodes"), folder]
-        replay = open_videos(videos, folder / "videos") if videos else Replay(places[0])
-        teacher, cfg = None, replace(cfg, dst=cfg.src)                        # also of old runs
+        fields, teacher, model = row_type(model.action_dim), model.teacher, model.model
+    replay = Replay(folder / "episodes", fields)
     stacked = isinstance(model.rssm, StackedRSSM)
     if metrics and (cfg.encoder != "beta_vae" or stacked):
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
-        raise UserError(f"no episodes in {replay.folder}; nothing to draw from (see --videos)")
+        raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
     # From the middle of the last episode: the colours of the end, and a pose that is not the start.
     rows = replay.read(replay.paths[-1])
     rows = rows[len(rows) // 2:][:50]
@@ -1900,7 +1862,7 @@ def doctor(cfg):
 
 def median_s(function, repeats):
     """Median wall time of a call, after one to warm up."""
-    return statistics.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
+    return np.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:])
 
 def bench(cfg, as_json=False, scaling=False, repeats=5):
     """Time the steps, count the parameters.

@@ -466,8 +466,10 @@ def check_teacher_is_frozen():
     assert same(agent.teacher, before)
     assert not agent.teacher.training
     assert all(p.grad is None and not p.requires_grad for p in agent.teacher.parameters())
-    trained = {id(p) for optimizer in agent.optimizers.values()
+    optimizers = [x for x in vars(agent).values() if isinstance(x, torch.optim.Optimizer)]
+    trained = {id(p) for optimizer in optimizers
                for group in optimizer.param_groups for p in group["params"]}
+    assert len(optimizers) == 3
     assert not trained & {id(p) for p in agent.teacher.parameters()}
 
 
@@ -1989,7 +1991,7 @@ def test_exactly_the_pretrained_weights_are_carried_over_and_the_rest_is_fresh(c
             assert width == value.shape[-1] or key == "rssm.inputs.0.weight"
         assert torch.equal(value, source), key
     assert_identical(agent["behaviour"], fresh["behaviour"])
-    assert state["trainer"]["teacher"] is None
+    assert "teacher" not in agent
 
 
 def test_run_that_carried_weights_over_resumes_bit_for_bit_without_the_pretraining(
@@ -2022,7 +2024,7 @@ def test_pipeline_of_methods_that_carry_weights_over(carried):
     assert "distill" not in values and np.isfinite(values["reward"])
     succeed("evaluate", "--run", folder)
     for run in (folder, video.parent):
-        succeed("traverse", "--run", run, "--videos", folder / "episodes")
+        succeed("traverse", "--run", run)
         check_picture(run / "open_loop.png")
     assert "world_model" in succeed("bench", "--method", method, *DEBUG)
 
@@ -2060,12 +2062,12 @@ def test_pretraining_sees_only_images_and_where_episodes_begin(root, tmp_path):
 def test_finetuning_takes_exactly_the_teachers_encoder_and_leaves_it_as_it_was(teacher, finished):
     """Section 2, row 2: the published code trains the teacher along. Its bytes must not change."""
     before = torch.load(teacher, weights_only=True)["trainer"]["model"]
-    after = torch.load(finished / "checkpoint.pt", weights_only=True)["trainer"]
-    kept = after["teacher"]["weights"]
+    after = torch.load(finished / "checkpoint.pt", weights_only=True)["trainer"]["agent"]
+    kept = after["teacher"]
     encoder = {key for key in before if key.startswith("encoder.")}
     assert {f"encoder.{key}" for key in kept} == encoder
     assert all(torch.equal(value, before[f"encoder.{key}"]) for key, value in kept.items())
-    assert not any(torch.equal(value, after["agent"]["model"][f"encoder.{key}"])
+    assert not any(torch.equal(value, after["model"][f"encoder.{key}"])
                    for key, value in kept.items() if key.endswith("weight"))
 
 
@@ -2730,7 +2732,8 @@ def everything(run):
     rows = [{key: value for key, value in row.items() if key not in ("seconds", "rate")}
             for row in read_rows(run)]
     files = {path.name: path.read_bytes() for path in sorted((run / "episodes").glob("*"))}
-    return dict(trainer=state["trainer"], rng=state["rng"], rows=rows, files=files)
+    assert state["log"] == (run / "metrics.jsonl").read_text()
+    return dict(trainer=state["trainer"], rows=rows, files=files)
 
 
 def assert_identical(one, two, where=""):
@@ -3061,7 +3064,7 @@ def test_full_disk_in_an_episode_loses_nothing(teacher, uncut, small_disk):
 
 
 @pytest.mark.parametrize("owner, name, call", [
-    (diswm.Run, "save", 3), (tensorboard.SummaryWriter, "add_scalar", 9), (os, "replace", 3)],
+    (diswm.Run, "save", 3), (tensorboard.SummaryWriter, "add_scalar", 9), (os, "replace", 5)],
     ids=["config.json", "TensorBoard", "checkpoint"])
 def test_full_disk_in_pretraining_loses_nothing(
         owner, name, call, root, brief, small_disk, monkeypatch):
@@ -3077,37 +3080,40 @@ def test_full_disk_in_pretraining_loses_nothing(
     assert_identical(everything(run), brief)
 
 
-def test_log_row_that_no_longer_fits_is_written_again_whole(root, brief, tmp_path):
-    """A real limit on file sizes tears the row after ten bytes; the next run takes them back."""
+def test_row_of_the_log_whose_checkpoint_does_not_fit_is_there_once(root, brief, tmp_path):
+    """A real limit on file sizes lets the log pass, and not the checkpoint that has the row too."""
     argv, run = pretrain_command(root, tmp_path), tmp_path / PRETRAINED
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    def tear():
-        size = (run / "metrics.jsonl").stat().st_size + 10
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
 
     try:
-        with before_call(diswm, "mean_metrics", 2, tear):
+        with before_call(diswm, "mean_metrics", 2, limit):
             code, _, err = run_cli(*argv)
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert code == 1 and "File too large" in err
-    assert not (run / "metrics.jsonl").read_bytes().endswith(b"\n")
-    assert len(diswm.read_log(run)) == 1
+    assert [row["update"] for row in read_rows(run)] == [5, 10]
+    assert diswm.read_checkpoint(run / "checkpoint.pt")["trainer"]["progress"] == 5
     succeed(*argv)
     assert_identical(everything(run), brief)
 
 
-def test_log_shorter_than_its_checkpoint_says_is_refused(finished, tmp_path):
-    """Filling it up with zero bytes, as truncation to a larger size does, would tear it."""
-    run = tmp_path / FINETUNED
-    shutil.copytree(finished, run)
-    with open(run / "metrics.jsonl", "r+b") as file:
-        file.truncate(100)
-    argv = ("finetune", "--dst", "walker_walk", "--runs", tmp_path, *DEBUG)
-    refuse(*argv, says=("metrics.jsonl", "shorter"))
-    (run / "metrics.jsonl").unlink()
+@pytest.mark.parametrize("spoil_log", [
+    lambda log: log.unlink(), lambda log: log.write_bytes(log.read_bytes()[:99]),
+    lambda log: log.write_bytes(log.read_bytes() + b'{"step": 999}\n')],
+    ids=["lost", "cut off", "a row too many"])
+def test_log_is_the_checkpoints_whatever_became_of_the_file(
+        spoil_log, root, brief, tmp_path, monkeypatch):
+    """The checkpoint has the log: a run that goes on writes all of it again."""
+    argv, run = pretrain_command(root, tmp_path), tmp_path / PRETRAINED
+    with monkeypatch.context() as patch:
+        send(patch, diswm.VideoTrainer, "update", 8, signal.SIGTERM)
+        assert run_cli(*argv)[0] == 143
+    spoil_log(run / "metrics.jsonl")
     succeed(*argv)
+    assert_identical(everything(run), brief)
 
 
 @slow
@@ -3415,12 +3421,11 @@ def test_no_path_in_a_checkpoint_is_followed(teacher, finished, tmp_path):
         watching and event in ("open", "os.listdir", "os.scandir")) else None)
     for command in ("traverse", "evaluate"):
         succeed(command, "--run", run)
-    refuse("traverse", "--run", tmp_path / PRETRAINED, says=("no episodes", "--videos"))
+    succeed("traverse", "--run", tmp_path / PRETRAINED)
     diswm.find_teacher(tiny_config(runs=str(tmp_path)), CPU)
     succeed("finetune", "--dst", "walker_walk", "--runs", tmp_path, *DEBUG)
     watching.clear()
     assert opened and not [path for path in opened if str(bait) in path]
-    succeed("traverse", "--run", tmp_path / PRETRAINED, "--videos", bait)
 
 
 def test_zip_bombs_are_refused_by_the_size_that_they_declare(teacher, tmp_path):
@@ -3810,7 +3815,7 @@ def teacher_in_the_optimiser(real):
     def init(self, cfg, action_dim, device, teacher=None):
         real(self, cfg, action_dim, device, teacher)
         weights = list(teacher.requires_grad_(True).parameters())
-        self.optimizers["model"].param_groups[0]["params"] += weights
+        self.model_adam.param_groups[0]["params"] += weights
     return init
 
 
