@@ -1691,8 +1691,9 @@ def disentanglement(codes, factors):
         importance.append(trees.feature_importances_ + 1e-12)
         r2.append([max(0.0, trees.score(codes[n:], factor[n:]))])
         tables = [np.histogram2d(factor, code, 20)[0] for code in codes.T]
+        # I = H(factor) + H(code) − H(both); the first is in all of them, so not in their gap.
         shared = [entropy(table.sum(0)) - entropy(table.ravel()) for table in tables]
-        mutual.append(np.sort(shared) / entropy(tables[0].sum(1)))  # I/H − 1: gaps do not see the 1
+        mutual.append(np.sort(shared) / entropy(tables[0].sum(1)))
     of_latents = 1 - entropy(importance, base=max(2, factors.shape[1]), axis=0)       # (Z,)
     of_factors = 1 - entropy(importance, base=max(2, codes.shape[1]), axis=1)         # (K,)
     return dict(disentanglement=np.average(of_latents, weights=np.sum(importance, 0)),
