@@ -199,7 +199,7 @@ METHODS = {  # sets of Config values and nothing else: all of them run through t
     "diswm": {},
     "no_distill": dict(eta=0.0, eta_end=0.0),        # ablation: no latent distillation
     "no_disentangle": dict(beta=0.0, beta2=0.0),     # ablation: no β in either stage
-    "dreamerv2": DV2,
+    "dreamerv2": DV2,  # DEVIATION: with Gaussian latents, also the next two (APV's are discrete)
     "dv2_finetune": DV2 | dict(carry_over="weights"),
     "apv": DV2 | dict(carry_over="stack", bonus=0.1),
 }
@@ -265,7 +265,8 @@ def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
     return torch.stack(returns[::-1])                                         # back in time order
 
 def squared_error(target, prediction, dims=0):
-    """−ln N(target; prediction, 1), less ½ ln 2π each, summed over the last `dims` dimensions."""
+    """−ln N(target; prediction, 1), summed over the last `dims` dimensions."""
+    # DEVIATION: without the constant ½ ln 2π of each, which would hide the rest of a loss.
     error = F.mse_loss(prediction, target, reduction="none")
     return 0.5 * (error.flatten(-dims).sum(-1) if dims else error)
 
@@ -535,8 +536,8 @@ class WorldModel(VideoPredictor):
 
     @torch.no_grad()
     def carry_over(self, video):
-        """Take over a VideoPredictor's encoder, decoder and RSSM (in a stack, as the one below).
-        No actions are as good as zeros, which train no input weights: the agent's own stay."""
+        """Take over a VideoPredictor's encoder, decoder and RSSM (in a stack, as the one below)."""
+        # DEVIATION: it saw no actions. Zeros are as good, and train no input weights: these stay.
         own = nn.ModuleList([self.encoder, self.decoder, getattr(self.rssm, "below", self.rssm)])
         for weight, value in zip(own.parameters(), video.parameters(), strict=True):
             weight[..., :value.shape[-1]] = value
@@ -916,7 +917,8 @@ vars(np).setdefault("in1d", np.isin)  # NumPy 2.4 dropped it; dm_control's quadr
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
 OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
 PHASES = ("train", "shifted", "eval", "none")
-COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))  # published
+# DEVIATION: around these, as published; the paper says around the original ones.
+COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))
 MATERIALS = dict(grid="floor", self="body")  # dm_control's names
 TRAINING, EVALUATION, PRETRAINING = 0, 1, 2  # streams of episode_seed
 if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its last lines
@@ -1098,11 +1100,12 @@ class Pixels(gym.ObservationWrapper):
             library = getattr(self.unwrapped, "mujoco_renderer", None)
             for key, value in (getattr(library, "default_cam_config", None) or {}).items():
                 setattr(self.camera, key, value)
-        model.vis.quality.shadowsize = 512  # 20–60 % of a frame, for a mean difference < 0.2 / 255
+        # DEVIATION: shadows cost 20–60 % less of a frame, for a mean difference < 0.2 / 255.
+        model.vis.quality.shadowsize = 512
         if fast:
             model.vis.quality.offsamples = 0  # half of the rest, for 1–2 / 255
         self.renderer = mujoco.Renderer(model, size, size)
-        # A mirroring floor costs 12 % of a frame (17 ms in DrawerWorld), and shows < 0.6 / 255.
+        # DEVIATION: no mirroring floor: 12 % of a frame (17 ms in DrawerWorld), for < 0.6 / 255.
         self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         atexit.register(self.renderer.close)  # one that is open at exit prints GL errors
 
@@ -1466,6 +1469,7 @@ def evaluate_agent(cfg, agent, envs, phase, replay=None):
     Returns their phase, training's but for drawers' table top that is never trained on; mean, list
     and standard deviation of their returns and, where the task tells, the share that succeeded."""
     played, count = [], envs.num_envs
+    # DEVIATION: the paper does not say in which colours; here, in those that training is in.
     phase = "eval" if family(cfg.dst) == "drawer" else phase
     torch.manual_seed(cfg.seed)
     for first in range(0, cfg.eval_episodes, count):
@@ -1945,7 +1949,7 @@ def parse_args(argv):
                 choices=choices, type=kind, metavar=None if choices else kind.__name__.upper())
             sub.add_argument("--" + field.name.strip("_").replace("_", "-"), dest=field.name,
                              default=argparse.SUPPRESS, **options,
-                             help=f"{meta['help']}; paper preset: {field.default or 'none'}")
+                             help=f"{meta['help']}; paper preset: {field.default!r}")
     args, unknown = parser.parse_known_args(argv)
     args, sub, own = vars(args), commands.choices[args.command], COMMANDS[args.command]
     if unknown:

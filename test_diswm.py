@@ -2785,7 +2785,7 @@ CUTS = {
 @pytest.mark.parametrize("where", CUTS)
 def test_finetuning_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
         where, teacher, uncut, tmp_path):
-    """Weights, Adam, slow critic, random numbers, replay files, log: wherever Ctrl-C falls."""
+    """Weights, Adam, slow critic, replay files, log: wherever Ctrl-C falls."""
     argv = cut_command(teacher, tmp_path)
     interrupt(*CUTS[where], argv)
     succeed(*argv)
@@ -2811,7 +2811,7 @@ def test_finetuning_cut_twice_anywhere_equals_an_uncut_run_bit_for_bit(
     (diswm.VideoTrainer, "update", 3), (diswm.VideoTrainer, "update", 8), (diswm.Run, "save", 3)])
 def test_pretraining_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
         owner, name, call, root, tmp_path, monkeypatch):
-    """Batches have numbers: only weights, Adam and torch's random numbers need saving."""
+    """Batches and noise follow from an update's number: only weights and Adam need saving."""
     monkeypatch.setattr(diswm.VideoTrainer, "chunk", 5)
     videos = next((root / "runs/collect").rglob("episodes"))
     argv = ("pretrain", "--videos", videos, *DEBUG, "--pretrain-updates", 12, "--runs")
