@@ -28,6 +28,7 @@ Symbols, and their names in the code:
 
 import argparse
 import atexit
+import bisect
 import contextlib
 import ctypes
 import dataclasses
@@ -245,7 +246,7 @@ def gaussian_distillation_loss(teacher, task):
 def eta_schedule(step, start=0.1, end=0.01, decay_steps=50_000, delay=0):
     """η after `step` decisions (section 3.4): 0 before `delay`, then linearly from start to end.
     The line would reach 0 at delay + decay_steps; η rests at `end` where it meets it."""
-    return 0.0 if step < delay else max(start * (1 - (step - delay) / decay_steps), end)
+    return 0.0 if step < delay else max(start * (1 - (step - delay) / decay_steps), min(start, end))
 
 def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
     """λ-target V_t (appendix B), the actor's objective and the critic's regression target.
@@ -791,6 +792,8 @@ def reading(path, kind="checkpoint of ours", remedy="restore it, or start over w
     try:
         yield
     except DAMAGED as error:
+        if re.search("(?i)alloc|out of memory|CUDA error", str(error)):       # main() says that
+            raise
         cause = f"{type(error).__name__}: {error}"[:120]
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from None
 
@@ -876,7 +879,7 @@ class Replay:
         """Rows start … start + length − 1: dict of (T, ...)"""
         pieces = []
         while length > 0:
-            index = np.searchsorted(self.ends, start, "right")
+            index = bisect.bisect_right(self.ends, start)
             rows = self.read(self.paths[index])[start - self.ends[index]:][:length]
             pieces.append(rows)
             start, length = start + len(rows), length - len(rows)
@@ -920,7 +923,7 @@ PHASES = ("train", "shifted", "eval", "none")
 # DEVIATION: around these, as published; the paper says around the original ones.
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3))
 MATERIALS = dict(grid="floor", self="body")  # dm_control's names
-TRAINING, EVALUATION, PRETRAINING = 0, 1, 2  # streams of episode_seed
+TRAINING, EVALUATION, PRETRAINING, COLLECTING = 0, 1, 2, 3  # streams of episode_seed
 if "DisWM/pusher-v0" not in gym.registry:  # a script imports itself, see its last lines
     for name in (*TASKS, *OTHER_TASKS):
         gym.register(f"DisWM/{name}-v0", "diswm:make_env", kwargs=dict(task=name))
@@ -945,7 +948,7 @@ def check_task(task):
 class DMControlEnv(gym.Env):
     """A task of dm_control.suite as a gymnasium.Env with a flat state, MuJoCo's model and data."""
     def __init__(self, domain, task):
-        self.env = suite.load(domain, task, environment_kwargs=dict(flat_observation=True))
+        self.env = suite.load(domain, task, dict(random=0), dict(flat_observation=True))
         spec, size = self.env.action_spec(), self.env.observation_spec()["observations"].shape
         self.action_space = gym.spaces.Box(np.float32(spec.minimum), np.float32(spec.maximum))
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, size, np.float64)
@@ -1401,10 +1404,9 @@ class AgentTrainer(Saved):
     unit, shown = "env steps", ("train_return", "eval_return", "image", "reward", "kl", "eta")
     parts, counters = ("agent", "replay"), ("progress", "decisions", "updates", "episodes")
 
-    def __init__(self, cfg, folder, device, teacher=None):
-        self.cfg = cfg
-        self.envs = config_envs(cfg, cfg.dst)
-        self.agent = Agent(cfg, self.envs.single_action_space.shape[0], device, teacher)
+    def __init__(self, cfg, envs, folder, device, teacher=None):
+        self.cfg, self.envs = cfg, envs
+        self.agent = Agent(cfg, envs.single_action_space.shape[0], device, teacher)
         rows = row_type(self.agent.action_dim, cfg.z_dim if teacher else 0)
         self.replay = Replay(folder / "episodes", rows, cfg.replay_capacity)
         self.progress = self.decisions = self.updates = self.episodes = 0
@@ -1433,7 +1435,8 @@ class AgentTrainer(Saved):
         """An episode in each environment, learning on the way → see play_episodes.
         It ends with the simulator's, at the colour switch, or with the run."""
         cfg, self.metrics, count = self.cfg, [], self.envs.num_envs
-        seeds = [episode_seed(cfg.seed, TRAINING, self.episodes + i) for i in range(count)]
+        stream = COLLECTING if cfg.src == cfg.dst else TRAINING               # of other colours
+        seeds = [episode_seed(cfg.seed, stream, self.episodes + i) for i in range(count)]
         torch.manual_seed(seeds[0])  # of all noise until the next: no random state to save
         random, actor = random_policy(seeds), functools.partial(self.agent.act, explore=True)
         self.phase, self.limit = "shifted", self.total
@@ -1507,8 +1510,9 @@ def find_teacher(cfg, device):
     own = run_folder(cfg, "pretrain")
     found = [own / "checkpoint.pt", *sorted(own.parent.glob("seed*/checkpoint.pt"))]
     path = Path(cfg.teacher) if cfg.teacher else next(filter(Path.exists, found), None)
-    command = f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method}"
-    command += f" --runs {cfg.runs}" * (cfg.runs != Config.runs)
+    runs = f" --runs {cfg.runs}" * (cfg.runs != Config.runs)
+    command = ("run, with the same --preset: python diswm.py pretrain "
+               f"--src {cfg.src} --method {cfg.method}{runs}")
     if cfg.src == cfg.dst:
         raise UserError(f"source and target are both {cfg.src}; choose another --src")
     if path is None:
@@ -1560,13 +1564,14 @@ def pretrain(cfg, fresh=False):
         raise UserError(f"{folder} has {videos.rows} frames, less than one window of "
                         f"{cfg.batch_length}; collect more, or lower --batch-length")
     print(f"videos: {folder}, {len(videos.paths):,} episodes, {videos.rows:,} frames")
+    last = videos.read(videos.paths[-1])
     for stale in set((run.folder / "videos").glob("*")) - {videos.folder}:    # as files changed
         shutil.rmtree(stale)
     if fresh:
         run.clear()
     seen = Replay(run.folder / "episodes")                                    # for traverse
     if not seen.paths:
-        seen.add(videos.read(videos.paths[-1]))
+        seen.add(last)
     torch.manual_seed(initial_seed(cfg, VideoPredictor))
     train(VideoTrainer(cfg, videos, torch.device(cfg.device)), run)
 
@@ -1579,13 +1584,15 @@ def finetune(cfg, fresh=False, stage="finetune"):
     elif cfg.eta > 0 or cfg.carry_over != "none":
         video = find_teacher(cfg, device)
         teacher = freeze(video.encoder) if cfg.eta > 0 else None
-    if fresh:
-        run.clear()
-    torch.manual_seed(initial_seed(cfg, WorldModel))
-    trainer = AgentTrainer(run.cfg, run.folder, device, teacher)
-    if video and cfg.carry_over != "none":
-        trainer.agent.model.carry_over(video)
-    with contextlib.closing(trainer.envs):
+    with contextlib.closing(config_envs(run.cfg, run.cfg.dst)) as envs:
+        if fresh:
+            run.clear()
+        torch.manual_seed(initial_seed(cfg, WorldModel))
+        trainer = AgentTrainer(run.cfg, envs, run.folder, device, teacher)
+        if trainer.replay.rows and not run.state:
+            raise UserError(f"{run.folder} has episodes and no checkpoint; start over with --fresh")
+        if video and cfg.carry_over != "none":
+            trainer.agent.model.carry_over(video)
         train(trainer, run)
     return run.folder
 
@@ -1708,8 +1715,8 @@ def disentanglement(codes, factors):
 def measure(cfg, model, teacher, path):
     """Score encoders, print and write JSON. Returns what each latent of the model follows most."""
     images, factors, names = labelled_frames(cfg)
-    torch.manual_seed(initial_seed(cfg, type(model)))                         # as training began
-    start = type(model)(cfg, model.rssm.action_dim).to(cfg.device).encoder
+    torch.manual_seed(initial_seed(model.cfg, type(model)))                   # as training began
+    start = type(model)(model.cfg, model.rssm.action_dim).to(cfg.device).encoder
     encoders = (dict(teacher=teacher) if teacher else {}) | dict(start=start, end=model.encoder)
     frames, result = torch.from_numpy(images).split(100), dict(task=cfg.dst, factors=names)
     for name, encoder in encoders.items():
@@ -1735,12 +1742,12 @@ def draw_grid(pictures, rows, columns, path, title=""):
 def traverse(cfg, folder, metrics=False):
     """Draw latent traversals and open-loop predictions of a run, from the last of its episodes."""
     device, fields, teacher = torch.device(cfg.device), VIDEO, None
-    cfg, model, _ = load_model(folder / "checkpoint.pt", device)
+    _, model, _ = load_model(folder / "checkpoint.pt", device)
     if isinstance(model, Agent):
         fields, teacher, model = row_type(model.action_dim), model.teacher, model.model
     replay = Replay(folder / "episodes", fields)
-    stacked = isinstance(model.rssm, StackedRSSM)
-    if metrics and (cfg.encoder != "beta_vae" or stacked):
+    traversable = model.cfg.encoder == "beta_vae" and not isinstance(model.rssm, StackedRSSM)
+    if metrics and not traversable:
         raise UserError(f"{folder} has no β-VAE latents to measure; traverse it without --metrics")
     if not replay.rows:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
@@ -1753,7 +1760,7 @@ def traverse(cfg, folder, metrics=False):
     strip = open_loop(model, batch)
     draw_grid(strip[:, ::4], ("truth", "model", "error"), range(0, strip.shape[1], 4),
               folder / "open_loop.png", "open-loop prediction: frames 5 … are predicted, not seen")
-    if cfg.encoder == "beta_vae" and not stacked:
+    if traversable:
         pictures, nats = latent_traversal(model, batch)
         order, path = np.argsort(-nats), folder / "disentanglement.json"      # informative first
         follows = measure(cfg, model, teacher, path) if metrics else [""] * len(nats)
@@ -1764,8 +1771,7 @@ def read_log(folder):
     """A run's metrics.jsonl → list of dicts. A line without its end, of a live run, is left out."""
     path = folder / "metrics.jsonl"
     with reading(path, "log of ours", "remove it"):
-        lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
-        rows = [json.loads(line) for line in lines]
+        rows = [json.loads(line) for line in path.read_bytes().split(b"\n")[:-1]]
         for row in rows:
             step = row["step" if "phase" in row else "update"]                # an agent's or not
             known = type(row.get("phase", "")) is str
@@ -1801,7 +1807,8 @@ def plot(cfg, folders, path):
     …/<tasks>/<method>/seed<k>; prints `curve_figures` and writes them beside the picture, JSON."""
     from matplotlib.figure import Figure  # slow to import
     curves, switches = {}, {}                 # {tasks: {method: [{step: return}]}}, {tasks: step}
-    for folder in folders or sorted(Path(cfg.runs).glob("finetune/*/*/seed*")):
+    logs = sorted(Path(cfg.runs).glob("finetune/*/*/seed*/metrics.jsonl"))
+    for folder in folders or [log.parent for log in logs]:
         rows = [row for row in read_log(folder) if "phase" in row]
         evaluated = [row for row in rows if "eval_return" in row]
         if curve := {row.get("eval_step", row["step"]): row["eval_return"] for row in evaluated}:
@@ -1813,7 +1820,7 @@ def plot(cfg, folders, path):
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
     figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), path or Path(cfg.runs) / "curves"
-    path = path.with_suffix(".png")
+    path = (path / "curves" if path.is_dir() else path).with_suffix(".png")
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (tasks, methods) in zip(panels, curves.items(), strict=True):
         for method, runs in sorted(methods.items()):
@@ -1881,7 +1888,7 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
     agent = Agent(cfg, *more)
     def update_s(learner, *args):
         data = replay.sample(learner.cfg.batch_size, learner.cfg.batch_length, rng)
-        return median_s(lambda: mean_metrics([learner.update(data, *args)]), max(1, repeats))
+        return median_s(lambda: check_finite(learner.update(data, *args)), max(1, repeats))
     with tempfile.TemporaryDirectory() as folder:
         replay = Replay(folder, row_type(agent.action_dim, cfg.z_dim if teacher else 0))
         noise = rng.integers(0, 256, (max(1000, cfg.batch_length), 64, 64, 3), np.uint8)

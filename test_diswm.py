@@ -50,7 +50,7 @@ from torch.distributions import Categorical, Normal, kl_divergence
 from torch.utils import tensorboard
 
 import diswm
-from diswm import METHODS, PRESETS, TASKS, AgentTrainer, Replay, UserError, make_env, make_row
+from diswm import METHODS, PRESETS, TASKS, Replay, UserError, make_env, make_row
 
 settings.register_profile(
     "diswm", max_examples=15, deadline=None, derandomize=bool(os.environ.get("CI")),
@@ -95,6 +95,11 @@ def make_agent(cfg, action_dim=2, seed=0):
     distils = cfg.eta > 0 and cfg.encoder == "beta_vae"
     teacher = diswm.freeze(diswm.BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth)) if distils else None
     return diswm.Agent(cfg, action_dim, CPU, teacher)
+
+
+def make_trainer(cfg, folder, teacher=None):
+    """A trainer with its environments."""
+    return diswm.AgentTrainer(cfg, diswm.config_envs(cfg, cfg.dst), Path(folder), CPU, teacher)
 
 
 def snapshot(module):
@@ -490,6 +495,12 @@ def test_eta_is_zero_before_its_delay_then_falls_to_its_exact_end(start, share, 
     assert half == pytest.approx(start * (1 - (decay // 2) / decay))
 
 
+@given(st.floats(0, 1), st.floats(0, 1), st.integers(0, 10**5))
+def test_eta_never_exceeds_its_start(start, end, step):
+    """The bug it kills: --eta 0.001 trained with the default end, 0.01, from the first decision."""
+    assert min(start, end) <= diswm.eta_schedule(step, start, end, 1000) <= start
+
+
 @pytest.mark.parametrize("step, eta", [
     (0, 0.1), (10_000, 0.08), (25_000, 0.05), (45_000, 0.01), (10**6, 0.01)])
 def test_eta_has_the_papers_values(step, eta):
@@ -530,7 +541,7 @@ def check_eta_falls_during_a_run(delay=0):
         patch.setattr(diswm, "make_env", lambda *a, **k: envs.append(FakeEnv()) or envs[-1])
         patch.setattr(diswm.Agent, "update", spy)
         teacher = diswm.freeze(diswm.BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth))
-        trainer = diswm.AgentTrainer(cfg, Path(folder), CPU, teacher)
+        trainer = make_trainer(cfg, folder, teacher)
         while trainer.progress < trainer.total:
             trainer.advance()
     assert len(seen) > 8
@@ -1367,7 +1378,7 @@ def counting_trainer(cfg, folder, length, terminates=False):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diswm, "config_env", lambda cfg, *args, **kwargs: diswm.ActionRepeat(
             CountingEnv(length, terminates), cfg.action_repeat))
-        return AgentTrainer(cfg, Path(folder), CPU)
+        return make_trainer(cfg, folder)
 
 
 @settings(max_examples=8)
@@ -1730,7 +1741,7 @@ def vector_config(envs, **changes):
 def test_parallel_envs_fill_the_replay_like_as_many_single_ones(tmp_path):
     """--envs 2 against --envs 1, bit for bit; two are processes of their own."""
     for envs in (1, 2):
-        trainer = AgentTrainer(vector_config(envs), tmp_path / str(envs), CPU)
+        trainer = make_trainer(vector_config(envs), tmp_path / str(envs))
         with contextlib.closing(trainer.envs):
             for _ in range(4 // envs):
                 for rows, *_ in trainer.play():
@@ -1760,7 +1771,7 @@ def test_parallel_episodes_end_one_by_one_and_updates_count_decisions(seed, ever
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         patch.setattr(diswm, "config_envs", lambda *args, **kwargs: envs)
         patch.setattr(diswm, "episode_seed", lambda run, stream, index: seeds[index])
-        trainer = AgentTrainer(cfg, Path(folder), CPU)
+        trainer = make_trainer(cfg, folder)
         trainer.replay.add(numbered_rows(0, 20))
         trainer.updates = 1
         trainer.agent.update = lambda *args: updates.append(trainer.decisions) or dict(
@@ -1808,7 +1819,7 @@ def switching_trainer(folder, **changes):
     """A real trainer whose midpoint, 50, falls into the middle of its third episode."""
     cfg = tiny_config("dreamerv2", steps=100, time_limit=20, prefill=1000, eval_every=1000,
                       eval_episodes=1, **changes)
-    return AgentTrainer(cfg, Path(folder), CPU)
+    return make_trainer(cfg, folder)
 
 
 def play_on(trainer, episodes=99):
@@ -2187,6 +2198,9 @@ def test_plot_writes_and_prints_the_figures_of_each_method(tmp_path):
     assert (found["before"][0], found["after"][0]) == (25.0, 35.0)
     assert "a-b: diswm, 2 seeds, final [35.0, 30.0, 40.0]" in out
     check_picture(tmp_path / "curves.png")
+    refuse("plot", folder, folder.parent / "seed9", says="seed9/metrics.jsonl")
+    succeed("plot", folder, "--out", folder)
+    check_picture(folder / "curves.png")
 
 
 def score(codes, factors):
@@ -2344,6 +2358,17 @@ def test_traverse_measures_disentanglement_and_labels_the_picture(
         check_picture(folder / "traversal.png", low=500)
 
 
+def test_traverse_measures_what_its_flags_say(teacher, monkeypatch):
+    """They override the run's own: a predictor of cheetahs, asked about walkers."""
+    asked = []
+    monkeypatch.setattr(diswm, "measure", lambda cfg, model, *args: (
+        asked.extend([cfg, model.cfg]) or [""] * 20))
+    succeed("traverse", "--metrics", "--run", teacher.parent, "--dst", "walker_walk", "--colors",
+            "original")
+    assert (asked[0].dst, asked[0].colors, asked[0].z_dim) == ("walker_walk", "original", 20)
+    assert (asked[1].dst, asked[1].colors) == ("cheetah_run", "published")
+
+
 def test_metrics_need_a_beta_vae(tmp_path):
     """DreamerV2's encoder has no latents of which to ask."""
     succeed("finetune", "--method", "dreamerv2", "--runs", tmp_path, *DEBUG, "--steps", 60,
@@ -2445,7 +2470,59 @@ def test_fresh_loses_nothing_to_a_mistake(finished, tmp_path):
     refuse(*argv, "--teacher", tmp_path / "nope.pt", says="nope.pt")
     refuse(*argv, "--batch-size", 10**6, "--batch-length", 1000, "--teacher",
            finished.parents[3] / PRETRAINED / "checkpoint.pt", says="memory")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diswm.mujoco, "Renderer", lambda *args: None.eglQueryString)
+        refuse(*argv, "--teacher", finished.parents[3] / PRETRAINED / "checkpoint.pt",
+               says="cannot render")
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_episodes_without_their_checkpoint_are_not_learnt_from(finished, tmp_path):
+    """The bug it kills: a run whose checkpoint was deleted began anew with the old episodes."""
+    run = tmp_path / FINETUNED
+    shutil.copytree(finished, run)
+    (run / "checkpoint.pt").unlink()
+    refuse("finetune", "--runs", tmp_path, *DEBUG, "--teacher",
+           finished.parents[3] / PRETRAINED / "checkpoint.pt", says=("no checkpoint", "--fresh"))
+    assert len([*(run / "episodes").iterdir()]) == len([*(finished / "episodes").iterdir()])
+
+
+@pytest.mark.parametrize("error", [
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory")])
+def test_too_little_memory_to_resume_is_not_called_a_damaged_checkpoint(
+        error, finished, tmp_path, monkeypatch):
+    """The bug it kills: the advice was --fresh, which would have deleted a good run."""
+    run = tmp_path / FINETUNED
+    shutil.copytree(finished, run)
+
+    def fail(*args):
+        raise error
+    monkeypatch.setattr(diswm, "ActorCritic", fail)
+    line = refuse("finetune", "--runs", tmp_path, *DEBUG, says="too large for the memory")
+    assert "fresh" not in line
+
+
+def test_videos_and_the_task_they_help_have_colours_of_their_own(tmp_path, monkeypatch):
+    """The bug it kills: of one seed, a teacher's videos had the colours of its student's task."""
+    played = []
+    monkeypatch.setattr(diswm, "play_episodes", lambda envs, policy, seeds, *args: (
+        played.append(seeds)))
+    for dst in ("cheetah_run", "walker_walk"):
+        trainer = counting_trainer(tiny_config("dreamerv2", dst=dst), tmp_path / dst, 9)
+        for trainer.episodes in range(20):
+            trainer.play()
+    collected, played = played[:20], played[20:]
+    assert not {*map(tuple, collected)} & {*map(tuple, played)}
+
+
+@pytest.mark.parametrize("task", ["lqr_lqr_2_1", "lqr_lqr_6_2"])
+def test_a_task_is_the_same_whenever_it_is_made(task):
+    """lqr draws its springs and dampers as it is built, once from a random source of its own."""
+    def states():
+        with contextlib.closing(make_env(task, seed=3, pixels=False)) as env:
+            return [env.step(np.ones(env.action_space.shape, np.float32))[0] for _ in range(5)]
+    assert np.array_equal(states(), states())
 
 
 def test_evaluate_plays_as_it_was_trained_but_for_what_it_is_given(finished, tmp_path):
