@@ -792,7 +792,7 @@ def reading(path, kind="checkpoint of ours", remedy="restore it, or start over w
     try:
         yield
     except DAMAGED as error:
-        if re.search("(?i)alloc|out of memory|CUDA error", str(error)):       # main() says that
+        if re.search("(?i)alloc|out of memory|CUDA error", str(error)):       # not the file's fault
             raise
         cause = f"{type(error).__name__}: {error}"[:120]
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from None
@@ -1815,8 +1815,7 @@ def plot(cfg, folders, path):
             tasks, method, _ = folder.resolve().parts[-3:]
             curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
             last = {row["phase"]: row["step"] for row in rows}                # of each phase
-            if len(last) > 1:
-                switches[tasks] = last["train"]
+            switches |= {tasks: last["train"]} if len(last) > 1 else {}
     if not curves:
         raise UserError("no evaluations to plot; run: python diswm.py finetune --dst walker_walk")
     figure, path = Figure(figsize=(5.5 * len(curves), 3.8)), path or Path(cfg.runs) / "curves"

@@ -2461,29 +2461,28 @@ def test_fresh_starts_over_and_other_flags_are_refused(root, tmp_path):
     succeed(*argv, "--beta2", 0.5, "--fresh")
 
 
-def test_fresh_loses_nothing_to_a_mistake(finished, tmp_path):
+def test_fresh_loses_nothing_to_a_mistake(finished, teacher, tmp_path):
     """The bug it kills: the old run was gone before the new one's teacher was looked for."""
     run = tmp_path / FINETUNED
     shutil.copytree(finished, run)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     argv = ("finetune", "--runs", tmp_path, *DEBUG, "--fresh")
     refuse(*argv, "--teacher", tmp_path / "nope.pt", says="nope.pt")
-    refuse(*argv, "--batch-size", 10**6, "--batch-length", 1000, "--teacher",
-           finished.parents[3] / PRETRAINED / "checkpoint.pt", says="memory")
+    refuse(*argv, "--batch-size", 10**6, "--batch-length", 1000, "--teacher", teacher,
+           says="memory")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diswm.mujoco, "Renderer", lambda *args: None.eglQueryString)
-        refuse(*argv, "--teacher", finished.parents[3] / PRETRAINED / "checkpoint.pt",
-               says="cannot render")
+        refuse(*argv, "--teacher", teacher, says="cannot render")
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_episodes_without_their_checkpoint_are_not_learnt_from(finished, tmp_path):
+def test_episodes_without_their_checkpoint_are_not_learnt_from(finished, teacher, tmp_path):
     """The bug it kills: a run whose checkpoint was deleted began anew with the old episodes."""
     run = tmp_path / FINETUNED
     shutil.copytree(finished, run)
     (run / "checkpoint.pt").unlink()
-    refuse("finetune", "--runs", tmp_path, *DEBUG, "--teacher",
-           finished.parents[3] / PRETRAINED / "checkpoint.pt", says=("no checkpoint", "--fresh"))
+    refuse("finetune", "--runs", tmp_path, *DEBUG, "--teacher", teacher,
+           says=("no checkpoint", "--fresh"))
     assert len([*(run / "episodes").iterdir()]) == len([*(finished / "episodes").iterdir()])
 
 
