@@ -1265,7 +1265,8 @@ MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")  # this machin
 
 def memory_needed(cfg):
     """GB, as measured. Raises UserError where this machine has less."""
-    memory, have = 0.95 + cfg.batch_size * cfg.batch_length * cfg.cnn_depth * 3.2e-5, MEMORY / 1e9
+    channels, have = cfg.batch_size * cfg.batch_length * cfg.cnn_depth, MEMORY / 1e9
+    memory = 0.8 + channels * (2.1e-5 if cfg.precision == "bf16" else 3.9e-5)
     if cfg.device == "cpu" and memory > have:
         raise UserError(f"needs about {memory:,.0f} GB of memory and this machine has {have:.0f}; "
                         "take a smaller --batch-size, --batch-length or --cnn-depth")
