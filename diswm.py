@@ -1611,6 +1611,7 @@ def finetune(cfg, fresh=False, stage="finetune"):
 def evaluate(cfg, folder):
     """Play episodes with a run's policy and with a random one; JSON and mp4 (stage 4).
     The actor's mode acts. Writes evaluation.json, its episodes, and the first as evaluation.mp4."""
+    map_apart(1 << 30)                          # as no update comes first: 1.5 ms of a decision
     _, agent, state = load_model(folder / "checkpoint.pt", torch.device(cfg.device))
     step = state["trainer"]["progress"]
     if not isinstance(agent, Agent):
