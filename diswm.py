@@ -623,18 +623,6 @@ def freeze(encoder):
     # DEVIATION: the published code switches the teacher's gradients back on and trains it along.
     return encoder.eval().requires_grad_(False)
 
-class Adam(torch.optim.Adam):
-    """The optimiser of a module's parameters (published)."""
-    def __init__(self, module, lr):
-        super().__init__(module.parameters(), lr=lr, eps=1e-5)
-
-    def load_state_dict(self, state):
-        """The moments; the rest is the Config's. Torch itself would take another model's."""
-        super().load_state_dict(dict(state, param_groups=self.state_dict()["param_groups"]))
-        for p, moments in self.state.items():
-            if [x.shape for x in moments.values()] != [(), p.shape, p.shape]:
-                raise ValueError("the optimiser's moments are another model's")
-
 def autocast(cfg):  # 1.7× of a whole step at 50 × 50 on a CPU with native bf16
     """bf16 around convolutions and MLPs; statistics, GRU state, targets and losses are fp32."""
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
@@ -646,15 +634,6 @@ def to_device(batch, device):
         batch = {key: value.pin_memory() for key, value in batch.items()}
     batch = {key: value.to(device, non_blocking=True) for key, value in batch.items()}
     return batch | {"image": preprocess(batch["image"])}
-
-def gradient_step(optimizer, loss, clip):
-    """Minimise loss over the optimiser's own parameters. Returns their gradient norm, unclipped."""
-    parameters = optimizer.param_groups[0]["params"]
-    loss.backward(inputs=parameters)  # the actor's graph runs through the model, which gets none
-    norm = nn.utils.clip_grad_norm_(parameters, clip)
-    optimizer.step()
-    optimizer.zero_grad()  # here, so that none lie between the next update's large buffers
-    return norm
 
 @functools.cache
 def map_apart(size):
@@ -689,6 +668,35 @@ class Saved:
             if type(state[name]) is not type(getattr(self, name)):
                 raise TypeError(f"{name} is {state[name]}")
             setattr(self, name, state[name])
+
+class Adam(Saved):
+    """The optimiser of a module's parameters (Kingma & Ba 2015), ε as published. Written out, as
+    torch.optim's first step imports torch's compiler: 69 MiB, and 0.9 s."""
+    parts, counters = ("mean", "square"), ("count",)
+
+    def __init__(self, module, lr):
+        self.lr, self.weights, self.count = lr, [*module.parameters()], 0
+        self.mean, self.square = (
+            nn.ParameterList(map(torch.zeros_like, self.weights)).requires_grad_(False)
+            for _ in self.parts)
+
+    @torch.no_grad()
+    def minimize(self, loss, clip, beta1=0.9, beta2=0.999, eps=1e-5):
+        """A step down the gradient of loss by these parameters alone, whatever else it reaches: a
+        gradient of a norm above `clip` is scaled down to it. Returns its norm before."""
+        gradients = torch.autograd.grad(loss, self.weights, materialize_grads=True)
+        norm = nn.utils.get_total_norm(gradients)
+        scale = (clip / (norm + 1e-6)).clamp(max=1)
+        self.count += 1
+        correction1, correction2 = (1 - beta**self.count for beta in (beta1, beta2))
+        for weight, gradient, mean, square in zip(
+                self.weights, gradients, self.mean, self.square, strict=True):
+            g = gradient * scale
+            mean.lerp_(g, 1 - beta1)                                          # E[g], from 0 on
+            square.mul_(beta2).addcmul_(g, g, value=1 - beta2)                # E[g²], likewise
+            std = (square.sqrt() / math.sqrt(correction2)).add_(eps)
+            weight.addcdiv_(mean, std, value=-self.lr / correction1)
+        return norm
 
 class Agent(Saved):
     """World model, actor-critic, frozen teacher and optimisers: what an online run trains."""
@@ -744,8 +752,8 @@ class Agent(Saved):
         if update % 100 == 0 and "distill" in metrics:                        # at the encoder
             grads = torch.autograd.grad(eta * metrics["distill"],
                                         [*self.model.encoder.parameters()], retain_graph=True)
-            metrics["distill_grad_norm"] = torch.stack([grad.norm() for grad in grads]).norm()
-        metrics["model_grad_norm"] = gradient_step(self.model_adam, loss, clip)
+            metrics["distill_grad_norm"] = nn.utils.get_total_norm(grads)
+        metrics["model_grad_norm"] = self.model_adam.minimize(loss, clip)
         if update % cfg.slow_every == 0:
             self.behaviour.copy_critic()
         start = {key: x.detach().flatten(0, 1) for key, x in out["post"].items()}  # data here
@@ -756,8 +764,8 @@ class Agent(Saved):
         with autocast(cfg):
             actor, critic, more = self.behaviour.losses(self.model, start, start.pop("discount"))
         metrics |= more
-        metrics["actor_grad_norm"] = gradient_step(self.actor_adam, actor, clip)
-        metrics["critic_grad_norm"] = gradient_step(self.critic_adam, critic, clip)
+        metrics["actor_grad_norm"] = self.actor_adam.minimize(actor, clip)
+        metrics["critic_grad_norm"] = self.critic_adam.minimize(critic, clip)
         map_apart(1 << 30)
         return {key: value.detach() for key, value in metrics.items()}
 
@@ -1393,7 +1401,7 @@ class VideoTrainer(Saved):
         batch = to_device(batch, self.device)
         with autocast(self.cfg):
             loss, metrics = self.model.loss(self.model(batch), batch)
-        norm = gradient_step(self.optimizer, loss, self.cfg.grad_clip)
+        norm = self.optimizer.minimize(loss, self.cfg.grad_clip)
         map_apart(1 << 30)
         return {key: value.detach() for key, value in metrics.items()} | {"model_grad_norm": norm}
 
@@ -1903,14 +1911,16 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
         return median_s(lambda: check_finite(learner.update(data, *args)), max(1, repeats))
     with tempfile.TemporaryDirectory() as folder:
         replay = Replay(folder, row_type(agent.action_dim, cfg.z_dim if teacher else 0))
-        noise = rng.integers(0, 256, (max(1000, cfg.batch_length), 64, 64, 3), np.uint8)
-        rows = [make_row(image, rng.uniform(-1, 1, agent.action_dim)) for image in noise]
+        noise = functools.partial(rng.integers, 0, 256, (64, 64, 3), np.uint8)
+        rows = [make_row(noise(), rng.uniform(-1, 1, agent.action_dim))
+                for _ in range(max(1000, cfg.batch_length))]
         replay.add(rows, **agent.taught(rows))
+        del rows
         result["train_step_s"] = update_s(agent, cfg.eta, 1)
+        result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         draw = functools.partial(replay.sample, cfg.batch_size, cfg.batch_length, rng)
         result["sample_ms"] = 1e3 * median_s(draw, 20)
         result["pretrain_step_s"] = update_s(VideoTrainer(cfg, None, device))
-        result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         for name in ("batch_size", "horizon") if scaling else ():
             sizes = [math.ceil(getattr(cfg, name) * part / 4) for part in (1, 2, 3, 4)]
             agents = [Agent(replace(cfg, **{name: size}), *more) for size in sizes]

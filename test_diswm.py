@@ -264,6 +264,27 @@ def test_the_maths_has_the_papers_values_by_default(function, defaults):
     assert {p.name: p.default for p in parameters if p.default is not p.empty} == defaults
 
 
+@pytest.mark.parametrize("clip", [1e9, 1e-2])
+def test_adam_steps_like_torchs_own_bit_for_bit(clip):
+    """A weight that a loss does not reach keeps its value; a continued optimiser goes on alike."""
+    torch.manual_seed(0)
+    ours = torch.nn.ModuleList(
+        [torch.nn.Linear(3, 4), torch.nn.LayerNorm(4), torch.nn.Linear(2, 2)])
+    theirs = copy.deepcopy(ours)
+    adam, oracle = diswm.Adam(ours, 1e-3), torch.optim.Adam(theirs.parameters(), 1e-3, eps=1e-5)
+    for step in range(20):
+        x = torch.randn(5, 3)
+        norm = adam.minimize((ours[1](ours[0](x))**3).sum(), clip)
+        oracle.zero_grad()
+        (theirs[1](theirs[0](x))**3).sum().backward()
+        assert norm == torch.nn.utils.clip_grad_norm_(theirs.parameters(), clip)
+        oracle.step()
+        assert same(ours, snapshot(theirs))
+        state, adam = adam.state_dict(), diswm.Adam(ours, 1e-3)
+        adam.load_state_dict(state)
+        assert adam.count == step + 1
+
+
 def test_actions_are_clipped_one_millionth_inside_the_bounds():
     """Section 2, row 8: ±(1 − 1e-6)."""
     clipped = diswm.clip_action(torch.tensor([-9.0, -0.5, 9.0], dtype=torch.float64))
@@ -471,9 +492,8 @@ def check_teacher_is_frozen():
     assert same(agent.teacher, before)
     assert not agent.teacher.training
     assert all(p.grad is None and not p.requires_grad for p in agent.teacher.parameters())
-    optimizers = [x for x in vars(agent).values() if isinstance(x, torch.optim.Optimizer)]
-    trained = {id(p) for optimizer in optimizers
-               for group in optimizer.param_groups for p in group["params"]}
+    optimizers = [x for x in vars(agent).values() if isinstance(x, diswm.Adam)]
+    trained = {id(p) for optimizer in optimizers for p in optimizer.weights}
     assert len(optimizers) == 3
     assert not trained & {id(p) for p in agent.teacher.parameters()}
 
@@ -772,9 +792,14 @@ def test_terms_are_per_step_and_losses_are_finite_scalars(
 
 @contextlib.contextmanager
 def kept_gradients():
-    """Inside, gradients outlive their step, so that one can look at them."""
+    """Inside, gradients stay on their weights, so that one can look at them."""
+    def grad(loss, weights, real=torch.autograd.grad, **how):
+        gradients = real(loss, weights, **how)
+        for weight, gradient in zip(weights, gradients, strict=True):
+            weight.grad = gradient
+        return gradients
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.optim.Optimizer, "zero_grad", lambda self: None)
+        patch.setattr(torch.autograd, "grad", grad)
         yield
 
 
@@ -2714,14 +2739,14 @@ def test_bf16_steps_like_fp32():
         gradients = {}
 
         def keep(optimizer, loss, clip):
-            parameters = optimizer.param_groups[0]["params"]
-            for p, g in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+            gradient = torch.autograd.grad(loss, optimizer.weights)
+            for p, g in zip(optimizer.weights, gradient, strict=True):
                 gradients[p] = g.flatten().double()
             losses.append(loss.item())
             return torch.zeros(())
         losses, model, behaviour = [], agent.model, agent.behaviour
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(diswm, "gradient_step", keep)
+            patch.setattr(diswm.Adam, "minimize", keep)
             agent.update(batch, 0.1, 1)
         modules = dict(model.named_children(), actor=behaviour.actor, critic=behaviour.critic)
         return losses[0], {name: torch.cat([gradients[p] for p in module.parameters()])
@@ -3448,11 +3473,10 @@ def test_spoilt_checkpoint_of_an_agent_is_one_line(finished, data):
     lambda x: x.double(), lambda x: x[..., None], lambda x: x * np.nan],
     ids=["float64", "another shape", "NaN"])
 def test_tensor_of_another_model_is_refused(spoilt, change, teacher, root, tmp_path):
-    """torch casts any dtype, and takes Adam's moments in any shape until they are used."""
+    """torch casts any dtype."""
     state = torch.load(teacher, weights_only=True)
     part = state["trainer"][spoilt]
-    part, key = (part, "encoder.net.0.weight") if spoilt == "model" else (
-        part["state"][0], "exp_avg")
+    part, key = (part, "encoder.net.0.weight") if spoilt == "model" else (part["mean"], "0")
     part[key] = change(part[key])
     (tmp_path / PRETRAINED).mkdir(parents=True)
     torch.save(state, tmp_path / PRETRAINED / "checkpoint.pt")
@@ -3900,8 +3924,8 @@ def teacher_in_the_optimiser(real):
     """The published code: the teacher's gradients on, its weights in the model's optimiser."""
     def init(self, cfg, action_dim, device, teacher=None):
         real(self, cfg, action_dim, device, teacher)
-        weights = list(teacher.requires_grad_(True).parameters())
-        self.model_adam.param_groups[0]["params"] += weights
+        teacher.requires_grad_(True)
+        self.model_adam = diswm.Adam(torch.nn.ModuleList([self.model, teacher]), cfg.model_lr)
     return init
 
 
