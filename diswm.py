@@ -676,9 +676,9 @@ class Adam(Saved):
 
     def __init__(self, module, lr):
         self.lr, self.weights, self.count = lr, [*module.parameters()], 0
-        self.mean, self.square = (
-            nn.ParameterList(map(torch.zeros_like, self.weights)).requires_grad_(False)
-            for _ in self.parts)
+        def zeros():
+            return nn.ParameterList(map(torch.zeros_like, self.weights)).requires_grad_(False)
+        self.mean, self.square = zeros(), zeros()
 
     @torch.no_grad()
     def minimize(self, loss, clip, beta1=0.9, beta2=0.999, eps=1e-5):
@@ -691,7 +691,7 @@ class Adam(Saved):
         correction1, correction2 = (1 - beta**self.count for beta in (beta1, beta2))
         for weight, gradient, mean, square in zip(
                 self.weights, gradients, self.mean, self.square, strict=True):
-            g = gradient * scale
+            g = gradient * scale  # not in place: autograd may give one tensor to two weights
             mean.lerp_(g, 1 - beta1)                                          # E[g], from 0 on
             square.mul_(beta2).addcmul_(g, g, value=1 - beta2)                # E[g²], likewise
             std = (square.sqrt() / math.sqrt(correction2)).add_(eps)
@@ -1904,18 +1904,17 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
     result |= {name: getattr(cfg, name) for name in ("method", "batch_size", "batch_length")}
     teacher = freeze(BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth).to(device)) if cfg.eta else None
     with config_env(cfg, cfg.dst, "none", pixels=False) as env:
-        more = *env.action_space.shape, device, teacher
-    agent = Agent(cfg, *more)
+        dims, = env.action_space.shape
+    agent = Agent(cfg, dims, device, teacher)
     def update_s(learner, *args):
         data = replay.sample(learner.cfg.batch_size, learner.cfg.batch_length, rng)
         return median_s(lambda: check_finite(learner.update(data, *args)), max(1, repeats))
     with tempfile.TemporaryDirectory() as folder:
-        replay = Replay(folder, row_type(agent.action_dim, cfg.z_dim if teacher else 0))
-        noise = functools.partial(rng.integers, 0, 256, (64, 64, 3), np.uint8)
-        rows = [make_row(noise(), rng.uniform(-1, 1, agent.action_dim))
+        replay = Replay(folder, row_type(dims, cfg.z_dim if teacher else 0))
+        rows = [make_row(rng.integers(0, 256, (64, 64, 3), np.uint8), rng.uniform(-1, 1, dims))
                 for _ in range(max(1000, cfg.batch_length))]
         replay.add(rows, **agent.taught(rows))
-        del rows
+        del rows                                                              # 12 MB of the peak
         result["train_step_s"] = update_s(agent, cfg.eta, 1)
         result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         draw = functools.partial(replay.sample, cfg.batch_size, cfg.batch_length, rng)
@@ -1923,7 +1922,7 @@ def bench(cfg, as_json=False, scaling=False, repeats=5):
         result["pretrain_step_s"] = update_s(VideoTrainer(cfg, None, device))
         for name in ("batch_size", "horizon") if scaling else ():
             sizes = [math.ceil(getattr(cfg, name) * part / 4) for part in (1, 2, 3, 4)]
-            agents = [Agent(replace(cfg, **{name: size}), *more) for size in sizes]
+            agents = [Agent(replace(cfg, **{name: size}), dims, device, teacher) for size in sizes]
             times = [update_s(each, cfg.eta, 1) for each in agents]
             growth = dict(exponent=float(np.polyfit(np.log(sizes), np.log(times), 1)[0]))
             result[f"{name}_scaling"] = dict(zip(map(str, sizes), times, strict=True)) | growth

@@ -482,12 +482,26 @@ def test_no_gradient_reaches_the_teachers_latents():
     check_no_gradient_reaches_the_teacher()
 
 
+@contextlib.contextmanager
+def kept_gradients():
+    """Inside, gradients stay on their weights, so that one can look at them."""
+    def grad(loss, weights, real=torch.autograd.grad, **how):
+        gradients = real(loss, weights, **how)
+        for weight, gradient in zip(weights, gradients, strict=True):
+            weight.grad = gradient
+        return gradients
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.autograd, "grad", grad)
+        yield
+
+
 def check_teacher_is_frozen():
     """Same bytes after three updates, evaluation mode, no gradients, in no optimiser."""
     agent = make_agent(tiny_config())
     before, student = snapshot(agent.teacher), snapshot(agent.model.encoder)
-    for update in range(3):
-        metrics = agent.update(fake_batch(seed=update), 0.6, update)
+    with kept_gradients():
+        for update in range(3):
+            metrics = agent.update(fake_batch(seed=update), 0.6, update)
     assert metrics["distill"] > 0 and not same(agent.model.encoder, student)
     assert same(agent.teacher, before)
     assert not agent.teacher.training
@@ -788,19 +802,6 @@ def test_terms_are_per_step_and_losses_are_finite_scalars(
         assert all(value.shape == () and value.isfinite() for value in metrics.values())
         for name, term in terms.items():
             torch.testing.assert_close(metrics[name], term.mean())
-
-
-@contextlib.contextmanager
-def kept_gradients():
-    """Inside, gradients stay on their weights, so that one can look at them."""
-    def grad(loss, weights, real=torch.autograd.grad, **how):
-        gradients = real(loss, weights, **how)
-        for weight, gradient in zip(weights, gradients, strict=True):
-            weight.grad = gradient
-        return gradients
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.autograd, "grad", grad)
-        yield
 
 
 def gets_gradient(modules):
