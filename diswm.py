@@ -159,6 +159,7 @@ class Config:
     lambda_: float = flag(0.95, "λ of the λ-return (table)", high=1)
     rho: float = flag(1.0, "ρ: 1 dynamics backprop, 0 REINFORCE (published)", high=1)
     entropy_scale: float = flag(1e-4, "weight of the actor's entropy (published)")
+    tanh_scale: float = flag(0.0, "weight of m², tanh(m) being the actor's mean (ours, after HER)")
     actor_lr: float = flag(8e-5, "learning rate of the actor (table)", high=1)
     critic_lr: float = flag(8e-5, "learning rate of the critic (table)", high=1)
     slow_every: int = flag(100, "updates between copies to the slow critic (published)", low=1)
@@ -568,9 +569,9 @@ class ActorCritic(nn.Module):
         self.slow_critic.load_state_dict(self.critic.state_dict())
 
     def policy(self, feat):
-        """→ mean in (−1, 1) and std of the normal of actions, (..., A)"""
-        mean, std = self.actor(feat)
-        return torch.tanh(mean), std
+        """→ mean in (−1, 1) and std of the normal of actions, and m = artanh(mean), (..., A)"""
+        m, std = self.actor(feat)
+        return torch.tanh(m), std, m
 
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
@@ -580,25 +581,26 @@ class ActorCritic(nn.Module):
           reward      r_0   r_1      r_{H−1}          r̂(s_t)
         discount      γ_0   γ_1      γ_{H−1}          γ̂(s_t)
 
-        Returns feats (H + 1, N, S + D), log_probs and entropies (H, N)."""
-        state, feats, log_probs, entropies = start, [model.rssm.feat(start)], [], []
+        Returns feats (H + 1, N, S + D), log_probs, entropies and m², summed over A, (H, N)."""
+        state, feats, log_probs, entropies, squares = start, [model.rssm.feat(start)], [], [], []
         for _ in range(self.cfg.horizon):
             # The policy takes its state as given; its gradient comes from where the action leads.
-            mean, std = self.policy(feats[-1].detach())
+            mean, std, m = self.policy(feats[-1].detach())
             raw = gaussian_sample(mean, std)
             log_probs.append(normal_log_prob(raw.detach(), mean, std))        # REINFORCE: a is data
             entropies.append(normal_entropy(std))
+            squares.append(m.square().sum(-1))
             # DEVIATION: the published "truncated" normal is not; here actions are clipped.
             state = model.rssm.prior(model.rssm.recur(state, clip_action(raw)))
             feats.append(model.rssm.feat(state))
-        return torch.stack(feats), torch.stack(log_probs), torch.stack(entropies)
+        return [*map(torch.stack, (feats, log_probs, entropies, squares))]
 
     def losses(self, model, start, start_discount):
         """start: dict of (N, ·) detached states; start_discount (N,): their true γ_0.
         Returns (actor_loss, critic_loss, metrics). The actor's graph runs through the world model,
         which is *not* trained here: take gradients for the actor's own parameters only."""
         cfg = self.cfg
-        feats, log_prob, entropy = self.imagine(model, start)
+        feats, log_prob, entropy, square = self.imagine(model, start)
         reward = model.reward(feats[:-1])                                     # (H, N)
         discount = torch.sigmoid(model.discount(feats[:-1]))
         discount = torch.cat([start_discount[None], discount[1:]])            # γ_0 is known
@@ -610,13 +612,15 @@ class ActorCritic(nn.Module):
         value = self.critic(feats[:-1].detach())                              # the model is fixed
         critic_loss = (weight * squared_error(target.detach(), value)).mean()  # sg(V_t)
         advantage = (target - value).detach()                                 # sg(V_t − v(s_t))
-        # ρ V_t + (1 − ρ) ln π(a_t | s_t) sg(V_t − v(s_t)) + scale · H[a_t | s_t]
+        # ρ V_t + (1 − ρ) ln π(a_t | s_t) sg(V_t − v(s_t)) + scale · H[a_t | s_t] − scale · m²
+        # m² (ours, off by default) keeps the tanh from saturating, where it learns nothing.
         objective = (cfg.rho * target + (1 - cfg.rho) * log_prob * advantage
-                     + cfg.entropy_scale * entropy)
+                     + cfg.entropy_scale * entropy - cfg.tanh_scale * square)
         actor_loss = -(weight * objective).mean()
         return actor_loss, critic_loss, dict(
-            actor=actor_loss, critic=critic_loss, actor_entropy=entropy.mean(), value=value.mean(),
-            imagined_reward=reward.mean(), imagined_return=target.mean())
+            actor=actor_loss, critic=critic_loss, actor_entropy=entropy.mean(),
+            actor_tanh=square.mean(), value=value.mean(), imagined_reward=reward.mean(),
+            imagined_return=target.mean())
 
 def freeze(encoder):
     """A teacher: evaluation mode, no gradient, in no optimiser."""
@@ -724,7 +728,7 @@ class Agent(Saved):
         image, action = (torch.as_tensor(x, device=self.device) for x in (image, action))
         embed = self.model.encoder.encode(preprocess(image))["embed"]
         state = self.model.rssm.step(state, action, embed, is_first)
-        mean, std = self.behaviour.policy(self.model.rssm.feat(state))
+        mean, std, _ = self.behaviour.policy(self.model.rssm.feat(state))
         return clip_action(gaussian_sample(mean, std) if explore else mean).cpu().numpy(), state
 
     @torch.no_grad()

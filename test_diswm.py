@@ -341,7 +341,7 @@ def test_evaluation_takes_the_actors_mode():
     agent, zeros = make_agent(tiny_config()), np.zeros((4, 2), np.float32)
     images = fake_batch(batch=1, length=4)["image"][0]
     action, state = agent.act(images, zeros, None, explore=False)
-    mean, _ = agent.behaviour.policy(agent.model.rssm.feat(state))
+    mean, _, _ = agent.behaviour.policy(agent.model.rssm.feat(state))
     np.testing.assert_allclose(action, mean.detach().numpy(), atol=1e-6)
     assert not np.allclose(action, agent.act(images, zeros, None, explore=True)[0])
 
@@ -670,21 +670,21 @@ def test_a_zero_discount_cuts_the_future(seed, end):
 
 def stubbed_behaviour(seed, horizon=4, **changes):
     """World model and actor-critic whose imagination is a given tensor; the slow critic differs."""
-    cfg = tiny_config(horizon=horizon, entropy_scale=0.3, **changes)
+    cfg = tiny_config(horizon=horizon, entropy_scale=0.3, tanh_scale=0.2, **changes)
     torch.manual_seed(seed)
     model, behaviour = diswm.WorldModel(cfg, 2), diswm.ActorCritic(cfg, 2)
     with torch.no_grad():
         for weights in behaviour.slow_critic.parameters():
             weights.add_(0.3 * torch.randn_like(weights))
     feats = leaf(3 * torch.randn(horizon + 1, 3, cfg.stoch + cfg.deter))
-    log_prob, entropy = leaf(torch.randn(horizon, 3)), leaf(torch.randn(horizon, 3))
-    behaviour.imagine = lambda *args: (feats, log_prob, entropy)
-    return model, behaviour, feats, log_prob, entropy
+    log_prob, entropy, square = (leaf(torch.randn(horizon, 3)) for _ in range(3))
+    behaviour.imagine = lambda *args: (feats, log_prob, entropy, square)
+    return model, behaviour, feats, log_prob, entropy, square
 
 
 def check_behaviour_losses_are_appendix_b(seed=0, rho=0.6):
     """Both losses against loops: targets of the slow critic, weights Π γ, true first discount."""
-    model, behaviour, feats, log_prob, entropy = stubbed_behaviour(seed, rho=rho)
+    model, behaviour, feats, log_prob, entropy, square = stubbed_behaviour(seed, rho=rho)
     first = 0.99 * torch.tensor([1.0, 0.0, 1.0])
     actor, critic, _ = behaviour.losses(model, model.rssm.initial(3), first)
     with torch.no_grad():
@@ -699,7 +699,8 @@ def check_behaviour_losses_are_appendix_b(seed=0, rho=0.6):
             advantage = target[t, n] - online[t, n]
             critic_sum += weight * 0.5 * advantage**2
             actor_sum -= weight * (rho * target[t, n] + 0.3 * entropy[t, n].item()
-                                   + (1 - rho) * log_prob[t, n].item() * advantage)
+                                   + (1 - rho) * log_prob[t, n].item() * advantage
+                                   - 0.2 * square[t, n].item())
             weight *= gamma[t, n].item()
     assert critic.item() == pytest.approx(critic_sum / 12, rel=1e-4, abs=1e-6)
     assert actor.item() == pytest.approx(actor_sum / 12, rel=1e-4, abs=1e-6)
@@ -707,14 +708,14 @@ def check_behaviour_losses_are_appendix_b(seed=0, rho=0.6):
 
 @given(seeds, st.floats(0, 1))
 def test_actor_and_critic_losses_are_those_of_appendix_b(seed, rho):
-    """ρ V + (1 − ρ) ln π · sg(V − v) + entropy; ½ (V − v)²; both weighted by Π γ."""
+    """ρ V + (1 − ρ) ln π · sg(V − v) + entropy − m²; ½ (V − v)²; both weighted by Π γ."""
     check_behaviour_losses_are_appendix_b(seed, rho)
 
 
 @pytest.mark.parametrize("rho", [0.0, 1.0])
 def test_rho_chooses_between_dynamics_backprop_and_reinforce(rho):
     """ρ = 1: the actor's gradient comes along the states; ρ = 0: along ln π only."""
-    model, behaviour, feats, log_prob, _ = stubbed_behaviour(0, rho=rho)
+    model, behaviour, feats, log_prob, _, _ = stubbed_behaviour(0, rho=rho)
     actor, critic, _ = behaviour.losses(model, model.rssm.initial(3), torch.full((3,), 0.99))
     by_state, by_log_prob = torch.autograd.grad(actor, (feats, log_prob), allow_unused=True,
                                                 retain_graph=True)
@@ -733,18 +734,34 @@ def test_dynamics_gradient_reaches_the_actor_through_imagined_states():
 
 
 def test_imagination_starts_at_the_given_states_and_makes_horizon_transitions():
-    """States s_0 … s_H, log-probs and entropies of a_0 … a_{H−1}."""
+    """States s_0 … s_H, log-probs, entropies and m² of a_0 … a_{H−1}."""
     agent = make_agent(tiny_config(horizon=4))
     start = {key: torch.randn_like(x) for key, x in agent.model.rssm.initial(5).items()}
-    feats, log_prob, entropy = agent.behaviour.imagine(agent.model, start)
-    assert len(feats) == 5 and log_prob.shape == entropy.shape == (4, 5)
+    feats, log_prob, entropy, square = agent.behaviour.imagine(agent.model, start)
+    assert len(feats) == 5 and log_prob.shape == entropy.shape == square.shape == (4, 5)
     torch.testing.assert_close(feats[0], torch.cat([start["stoch"], start["deter"]], -1))
+    mean = agent.behaviour.policy(feats[:-1])[0]
+    torch.testing.assert_close(square, torch.atanh(mean).square().sum(-1))
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.01])
+def test_the_scale_of_m_squared_revives_an_actor_whose_tanh_is_saturated(scale):
+    """At m = ±9 tanh lets nothing through: without the scale the mode stays, whatever it earns."""
+    agent = make_agent(tiny_config(tanh_scale=scale, actor_lr=0.01))
+    bias = list(agent.behaviour.actor.parameters())[-1]  # of (mean, std), two numbers each
+    with torch.no_grad():
+        bias[:2] = torch.tensor([9.0, -9.0])
+    start, first = agent.model.rssm.initial(8), torch.full((8,), 0.99)
+    for _ in range(200):
+        loss, _, metrics = agent.behaviour.losses(agent.model, start, first)
+        agent.actor_adam.minimize(loss, 100.0)
+    assert (metrics["actor_tanh"] > 2 * 8**2) == (scale == 0)
 
 
 def test_log_prob_trains_the_policy_for_given_states_and_actions():
     """REINFORCE: states and actions are data; ln π trains the mean and nothing in the model."""
     agent = make_agent(tiny_config(horizon=4))
-    _, log_prob, entropy = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(5))
+    _, log_prob, entropy, _ = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(5))
     bias = list(agent.behaviour.actor.parameters())[-1]  # of (mean, std), two numbers each
     model = list(agent.model.rssm.parameters())
     grads = torch.autograd.grad(log_prob.sum() + entropy.sum(), [bias, *model], allow_unused=True)
@@ -1059,8 +1076,8 @@ def test_imagination_goes_on_without_the_rssm_below():
     start = {key: torch.randn_like(x) for key, x in agent.model.rssm.initial(4).items()}
     other = start | {"below": torch.randn_like(start["below"])}
     with no_noise():
-        feats, _, _ = agent.behaviour.imagine(agent.model, start)
-        again, _, _ = agent.behaviour.imagine(agent.model, other)
+        feats, _, _, _ = agent.behaviour.imagine(agent.model, start)
+        again, _, _, _ = agent.behaviour.imagine(agent.model, other)
     assert torch.equal(feats, again)
 
 
@@ -1197,7 +1214,7 @@ def check_padded_actions_never_leak():
             metrics = [agent.update(batch, 0.0, update) for update in range(2)]
         action, state = agent.act(image, np.zeros((3, 2), np.float32), None, explore=True)
         action, state = agent.act(image, action, state, explore=True)
-        _, log_prob, entropy = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(3))
+        _, log_prob, entropy, _ = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(3))
         results.append(dict(metrics=metrics, action=action.tolist(), state=state,
                             imagined=dict(log_prob=log_prob, entropy=entropy)))
         assert action.shape == (3, 2) and not weight.grad[:, cfg.stoch + 2:].any()
