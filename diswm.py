@@ -1861,7 +1861,7 @@ def plot(cfg, folders, path):
         axes.set(title=re.sub(r"-(?!v\d)", " → ", tasks),                     # Hopper-v5
                  ylim=(min(0, axes.get_ylim()[0]), None),                     # pusher's are below
                  xlabel="env steps", ylabel="evaluation return")
-        axes.legend()
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)  # hides no curve
         axes.grid(alpha=0.3)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100, bbox_inches="tight")
