@@ -294,21 +294,6 @@ def stack(layer, sizes, shapes):
     return [part for n, m, shape in zip(sizes[:-1], sizes[1:], shapes, strict=True)
             for part in (layer(n, m, *shape), nn.ELU(inplace=True))]  # 19 % less memory at 50 × 50
 
-class MLP(nn.Sequential):
-    """`layers` hidden layers with ELU, then a linear one, to a number (...,) or, given `dims`, to
-    a normal's mean and standard deviation in (0.1, 2.1), (..., dims) each. fp32 out."""
-    def __init__(self, inputs, units, layers, dims=None):
-        hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
-        super().__init__(*hidden, nn.Linear(units, 2 * dims if dims else 1))
-        self.dims = dims
-
-    def forward(self, x):
-        x = super().forward(x).float()
-        if not self.dims:
-            return x.squeeze(-1)
-        mean, std = x.chunk(2, -1)
-        return mean, 2 * torch.sigmoid(std / 2) + 0.1
-
 def kaiming(module):
     """Kaiming-normal weights and zero biases, for the β-VAE only (published)."""
     if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
@@ -336,6 +321,21 @@ class PerFrame(nn.Module):
     def encode(self, image):
         """→ dict of `embed`; a β-VAE's is a latent_code"""
         return dict(embed=self(image))
+
+class MLP(PerFrame):
+    """`layers` hidden layers with ELU, then a linear one, to a number (...,) or, given `outputs`,
+    to a normal's mean and standard deviation in (0.1, 2.1), (..., outputs) each. fp32 out."""
+    def __init__(self, inputs, units, layers, outputs=None):
+        hidden = stack(nn.Linear, [inputs] + [units] * layers, [()] * layers)
+        super().__init__(1, *hidden, nn.Linear(units, 2 * outputs if outputs else 1))
+        self.outputs = outputs
+
+    def forward(self, x):
+        x = super().forward(x)
+        if not self.outputs:
+            return x.squeeze(-1)
+        mean, std = x.chunk(2, -1)
+        return mean, 2 * torch.sigmoid(std / 2) + 0.1
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → mean, logvar of 𝐳, (..., Z)."""
@@ -581,7 +581,8 @@ class ActorCritic(nn.Module):
           reward      r_0   r_1      r_{H−1}          r̂(s_t)
         discount      γ_0   γ_1      γ_{H−1}          γ̂(s_t)
 
-        Returns feats (H + 1, N, S + D), log_probs, entropies and m², summed over A, (H, N)."""
+        Returns feats s_0 … s_{H−1} (H, N, S + D), s_H (N, S + D), and, (H, N) each, log_probs,
+        entropies and m², summed over A."""
         state, feats, log_probs, entropies, squares = start, [model.rssm.feat(start)], [], [], []
         for _ in range(self.cfg.horizon):
             # The policy takes its state as given; its gradient comes from where the action leads.
@@ -593,23 +594,24 @@ class ActorCritic(nn.Module):
             # DEVIATION: the published "truncated" normal is not; here actions are clipped.
             state = model.rssm.prior(model.rssm.recur(state, clip_action(raw)))
             feats.append(model.rssm.feat(state))
-        return [*map(torch.stack, (feats, log_probs, entropies, squares))]
+        last = feats.pop()
+        return torch.stack(feats), last, *map(torch.stack, (log_probs, entropies, squares))
 
     def losses(self, model, start, start_discount):
         """start: dict of (N, ·) detached states; start_discount (N,): their true γ_0.
         Returns (actor_loss, critic_loss, metrics). The actor's graph runs through the world model,
         which is *not* trained here: take gradients for the actor's own parameters only."""
         cfg = self.cfg
-        feats, log_prob, entropy, square = self.imagine(model, start)
-        reward = model.reward(feats[:-1])                                     # (H, N)
-        discount = torch.sigmoid(model.discount(feats[:-1]))
+        feats, last, log_prob, entropy, square = self.imagine(model, start)
+        reward = model.reward(feats)                                          # (H, N)
+        discount = torch.sigmoid(model.discount(feats))
         discount = torch.cat([start_discount[None], discount[1:]])            # γ_0 is known
-        slow = self.slow_critic(feats)                                        # (H + 1, N)
         # DEVIATION: the published λ-return comes out reversed in time.
-        target = lambda_return(reward, slow[:-1], discount, slow[-1], cfg.lambda_)
+        slow, bootstrap = self.slow_critic(feats), self.slow_critic(last)
+        target = lambda_return(reward, slow, discount, bootstrap, cfg.lambda_)
         # w_t = Π_{i<t} γ_i: how likely the episode still runs. A weight, nothing to optimise.
         weight = torch.cat([torch.ones_like(discount[:1]), discount[:-1]]).cumprod(0).detach()
-        value = self.critic(feats[:-1].detach())                              # the model is fixed
+        value = self.critic(feats.detach())                                   # the model is fixed
         critic_loss = (weight * squared_error(target.detach(), value)).mean()  # sg(V_t)
         advantage = (target - value).detach()                                 # sg(V_t − v(s_t))
         # ρ V_t + (1 − ρ) ln π(a_t | s_t) sg(V_t − v(s_t)) + scale · H[a_t | s_t] − scale · m²

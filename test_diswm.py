@@ -678,7 +678,7 @@ def stubbed_behaviour(seed, horizon=4, **changes):
             weights.add_(0.3 * torch.randn_like(weights))
     feats = leaf(3 * torch.randn(horizon + 1, 3, cfg.stoch + cfg.deter))
     log_prob, entropy, square = (leaf(torch.randn(horizon, 3)) for _ in range(3))
-    behaviour.imagine = lambda *args: (feats, log_prob, entropy, square)
+    behaviour.imagine = lambda *args: (feats[:-1], feats[-1], log_prob, entropy, square)
     return model, behaviour, feats, log_prob, entropy, square
 
 
@@ -737,10 +737,11 @@ def test_imagination_starts_at_the_given_states_and_makes_horizon_transitions():
     """States s_0 … s_H, log-probs, entropies and m² of a_0 … a_{H−1}."""
     agent = make_agent(tiny_config(horizon=4))
     start = {key: torch.randn_like(x) for key, x in agent.model.rssm.initial(5).items()}
-    feats, log_prob, entropy, square = agent.behaviour.imagine(agent.model, start)
-    assert len(feats) == 5 and log_prob.shape == entropy.shape == square.shape == (4, 5)
+    feats, last, log_prob, entropy, square = agent.behaviour.imagine(agent.model, start)
+    assert len(feats) == 4 and last.shape == feats[0].shape
+    assert log_prob.shape == entropy.shape == square.shape == (4, 5)
     torch.testing.assert_close(feats[0], torch.cat([start["stoch"], start["deter"]], -1))
-    mean = agent.behaviour.policy(feats[:-1])[0]
+    mean = agent.behaviour.policy(feats)[0]
     torch.testing.assert_close(square, torch.atanh(mean).square().sum(-1))
 
 
@@ -761,7 +762,7 @@ def test_the_scale_of_m_squared_revives_an_actor_whose_tanh_is_saturated(scale):
 def test_log_prob_trains_the_policy_for_given_states_and_actions():
     """REINFORCE: states and actions are data; ln π trains the mean and nothing in the model."""
     agent = make_agent(tiny_config(horizon=4))
-    _, log_prob, entropy, _ = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(5))
+    *_, log_prob, entropy, _ = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(5))
     bias = list(agent.behaviour.actor.parameters())[-1]  # of (mean, std), two numbers each
     model = list(agent.model.rssm.parameters())
     grads = torch.autograd.grad(log_prob.sum() + entropy.sum(), [bias, *model], allow_unused=True)
@@ -1076,9 +1077,9 @@ def test_imagination_goes_on_without_the_rssm_below():
     start = {key: torch.randn_like(x) for key, x in agent.model.rssm.initial(4).items()}
     other = start | {"below": torch.randn_like(start["below"])}
     with no_noise():
-        feats, _, _, _ = agent.behaviour.imagine(agent.model, start)
-        again, _, _, _ = agent.behaviour.imagine(agent.model, other)
-    assert torch.equal(feats, again)
+        feats, last, *_ = agent.behaviour.imagine(agent.model, start)
+        again, same_last, *_ = agent.behaviour.imagine(agent.model, other)
+    assert torch.equal(feats, again) and torch.equal(last, same_last)
 
 
 class BonusOracle:
@@ -1214,7 +1215,7 @@ def check_padded_actions_never_leak():
             metrics = [agent.update(batch, 0.0, update) for update in range(2)]
         action, state = agent.act(image, np.zeros((3, 2), np.float32), None, explore=True)
         action, state = agent.act(image, action, state, explore=True)
-        _, log_prob, entropy, _ = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(3))
+        *_, log_prob, entropy, _ = agent.behaviour.imagine(agent.model, agent.model.rssm.initial(3))
         results.append(dict(metrics=metrics, action=action.tolist(), state=state,
                             imagined=dict(log_prob=log_prob, entropy=entropy)))
         assert action.shape == (3, 2) and not weight.grad[:, cfg.stoch + 2:].any()
