@@ -907,6 +907,20 @@ def test_the_autoencoder_has_the_papers_sizes_by_default():
     mean, logvar = diswm.BetaVAEEncoder()(image)
     assert mean.shape == logvar.shape == (2, 3, 20)
     assert diswm.BetaVAEDecoder(250)(torch.zeros(2, 3, 250)).shape == image.shape
+
+
+@given(seeds, st.sampled_from([(4, 2, 1), (4, 1, 0), (5, 2, 0), (6, 2, 0)]), st.integers(1, 5))
+def test_a_deconvolution_is_torchs_with_all_its_gradients(seed, shape, size):
+    """Summing the bias' gradient apart changes nothing, behind an ELU that works in place too."""
+    torch.manual_seed(seed)
+    ours, torchs = diswm.Deconvolution(3, 2, *shape), torch.nn.ConvTranspose2d(3, 2, *shape)
+    torchs.load_state_dict(ours.state_dict())
+    x, results = leaf(torch.randn(2, 3, size, size)), []
+    for layer in (ours, torchs):
+        out = torch.nn.functional.elu_(layer(x))
+        gradients = torch.autograd.grad(out.square().sum(), [x, layer.weight, layer.bias])
+        results.append((out.detach(), *gradients))
+    torch.testing.assert_close(*results)
     assert sum(p.numel() for p in diswm.BetaVAEEncoder(z_dim=20, depth=32).parameters()) == 389_096
 
 
