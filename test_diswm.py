@@ -1205,7 +1205,7 @@ def test_dv2_finetune_pads_actions_to_the_larger_of_both_tasks(src, dst, padded)
     own = TASK_ACTIONS[dst]
     agent = make_agent(tiny_config("dv2_finetune", src=src, dst=dst), own)
     assert agent.model.rssm.action_dim == padded and agent.action_dim == own
-    assert agent.behaviour.actor[-1].out_features == 2 * own
+    assert agent.behaviour.actor.net[-1].out_features == 2 * own
     for method in METHODS.keys() - {"dv2_finetune"}:
         assert make_agent(tiny_config(method, src=src, dst=dst), own).model.rssm.action_dim == own
 
