@@ -836,7 +836,8 @@ def reading(path, kind="checkpoint of ours", remedy="restore it, or start over w
     try:
         yield
     except DAMAGED as error:
-        if re.search("(?i)alloc|out of memory|CUDA error", str(error)):       # not the file's fault
+        said = str(error).split("\n")[0]                 # C++ frames below it name allocators
+        if re.search("(?i)alloc|out of memory|CUDA error", said):             # not the file's fault
             raise
         cause = f"{type(error).__name__}: {error}"[:120]
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from None

@@ -3501,6 +3501,14 @@ def test_spoilt_checkpoint_of_an_agent_is_one_line(finished, data):
         one_line_or_none(diswm.load_model, run / "checkpoint.pt", CPU)
 
 
+def test_a_number_beyond_64_bits_is_the_files_fault_and_not_the_memorys(finished, tmp_path):
+    """torch's error ends in C++ frames with "std::allocator": that looked like a lack of memory."""
+    state = torch.load(finished / "checkpoint.pt", weights_only=True)
+    state["trainer"]["agent"]["action_dim"] = 10**30
+    torch.save(state, tmp_path / "checkpoint.pt")
+    assert not one_line_or_none(diswm.load_model, tmp_path / "checkpoint.pt", CPU)
+
+
 @pytest.mark.parametrize("spoilt", ["model", "optimizer"])
 @pytest.mark.parametrize("change", [
     lambda x: x.double(), lambda x: x[..., None], lambda x: x * np.nan],
