@@ -691,7 +691,8 @@ class Saved:
         for name in self.parts:
             getattr(self, name).load_state_dict(state[name])
         for name in self.counters:
-            if type(state[name]) is not type(getattr(self, name)):
+            known = type(state[name]) is type(getattr(self, name))
+            if not known or type(state[name]) is int and not 0 <= state[name] < 2**62:
                 raise TypeError(f"{name} is {state[name]}")
             setattr(self, name, state[name])
 

@@ -3489,6 +3489,16 @@ def test_spoilt_checkpoint_of_a_video_predictor_is_one_line(teacher, root, data)
         assert code == 0 or (code == 1 and err.startswith("error: ") and err.count("\n") == 1), err
 
 
+@pytest.mark.parametrize("progress", [-1, 10**30])
+def test_impossible_progress_is_one_line(progress, teacher, root, tmp_path):
+    state = torch.load(teacher, weights_only=True)
+    state["trainer"]["progress"] = progress
+    (tmp_path / PRETRAINED).mkdir(parents=True)
+    torch.save(state, tmp_path / PRETRAINED / "checkpoint.pt")
+    code, _, err = run_cli(*pretrain_command(root, tmp_path, 20))
+    assert code == 1 and err.startswith("error: ") and err.count("\n") == 1, err
+
+
 @settings(max_examples=60)
 @given(data=st.data())
 def test_spoilt_checkpoint_of_an_agent_is_one_line(finished, data):
