@@ -691,10 +691,11 @@ class Saved:
         for name in self.parts:
             getattr(self, name).load_state_dict(state[name])
         for name in self.counters:
-            known = type(state[name]) is type(getattr(self, name))
-            if not known or type(state[name]) is int and not 0 <= state[name] < 2**62:
-                raise TypeError(f"{name} is {state[name]}")
-            setattr(self, name, state[name])
+            value, kind = state[name], type(getattr(self, name))
+            # a count seeds numpy, which takes no negative, and TensorBoard's steps have 64 bits
+            if type(value) is not kind or (kind is int and not 0 <= value < 2**62):
+                raise TypeError(f"{name} is {value}")
+            setattr(self, name, value)
 
 class Adam(Saved):
     """The optimiser of a module's parameters (Kingma & Ba 2015), ε as published. Written out, as
