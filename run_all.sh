@@ -7,9 +7,12 @@ CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")"
 # Left to itself, MuJoCo picks GLFW, which needs a display.
 export MUJOCO_GL=${MUJOCO_GL:-egl}
 
-# The small preset, cut down until all of it takes ten minutes on two CPU cores.
-tour=(--preset small --collect-steps 4000 --pretrain-updates 200 --steps 8000 --prefill 1000
-      --eval-every 4000 --eval-episodes 3)
+# The small preset, cut down until all of it takes ten minutes on two CPU cores: flags of all three
+# stages, and of one each.
+tour=(--preset small --prefill 1000 --eval-every 4000 --eval-episodes 3)
+tour_collect=(--collect-steps 4000)
+tour_pretrain=(--pretrain-updates 200)
+tour_finetune=(--steps 8000)
 
 usage() {
     cat <<'EOF'
@@ -122,11 +125,20 @@ diswm() {
     .venv/bin/python diswm.py "$@"
 }
 
-read_settings() {  # environment variables -> size, runs, pairs, methods, trainings
+read_settings() {  # environment variables -> size, collect, pretrain, finetune (flags of the
+                   # stages), runs, pairs, methods, trainings
     local preset=${PRESET:-tour} pair method seed
     case $preset in
-        tour) size=("${tour[@]}") ;;
-        small | paper) size=(--preset "$preset") ;;
+        tour)
+            size=("${tour[@]}")
+            collect=("${tour_collect[@]}")
+            pretrain=("${tour_collect[@]}" "${tour_pretrain[@]}")
+            finetune=("${tour_finetune[@]}")
+            ;;
+        small | paper)
+            size=(--preset "$preset")
+            collect=() pretrain=() finetune=()
+            ;;
         *) die "PRESET=$preset does not exist; use small or paper, or none for the tour" 2 ;;
     esac
     runs=runs/$preset  # apart, since a run only goes on with the settings that it was started with
@@ -141,7 +153,7 @@ read_settings() {  # environment variables -> size, runs, pairs, methods, traini
         fi
         for method in $methods; do
             for seed in ${SEEDS:-0}; do
-                trainings+=("$runs/finetune/${pair/:/-}/$method/seed$seed ${size[*]}\
+                trainings+=("$runs/finetune/${pair/:/-}/$method/seed$seed ${size[*]} ${finetune[*]}\
  --src ${pair%:*} --dst ${pair#*:} --method $method --seed $seed")
             done
         done
@@ -155,7 +167,9 @@ import diswm
 
 try:
     for line in sys.stdin:
-        diswm.parse_args(["finetune", *line.split()[1:]])
+        given, _ = diswm.parse_args(["finetune", *line.split()[1:]])
+        diswm.check_task(given["src"])
+        diswm.check_task(given["dst"])
 except diswm.UserError as error:
     print(f"error: {error}", file=sys.stderr)
     sys.exit(2)'
@@ -168,8 +182,8 @@ pretrain_teachers() {  # one per pair and method, with seed 0: it serves all see
             case $method in
                 dreamerv2 | no_distill) ;;  # learn without videos
                 *)
-                    diswm collect --src "${pair%:*}" "${size[@]}"
-                    diswm pretrain --src "${pair%:*}" --method "$method" "${size[@]}"
+                    diswm collect --src "${pair%:*}" "${size[@]}" "${collect[@]}"
+                    diswm pretrain --src "${pair%:*}" --method "$method" "${size[@]}" "${pretrain[@]}"
                     ;;
             esac
         done
@@ -219,7 +233,8 @@ show_results() {
         diswm traverse --run "$run"
     done
     for pair in $pairs; do
-        diswm plot "$runs/finetune/${pair/:/-}"/*/seed* --out "$runs/${pair/:/-}.png"
+        echo "\$ python results/plot.py $runs/finetune/${pair/:/-}/*/seed*"
+        .venv/bin/python results/plot.py "$runs/finetune/${pair/:/-}"/*/seed* --out "$runs/${pair/:/-}.png"
     done
 
     echo
