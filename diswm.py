@@ -379,8 +379,8 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, **settings):
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         env = gym.wrappers.TimeLimit(env, time_limit or limit)
         env = DistractingEnv(env, task, phase, **settings)
-    except (AttributeError, gym.error.Error, ImportError, OSError, RuntimeError, TypeError,
-            ValueError) as error:
+    except (AttributeError, gym.error.Error, ImportError, mujoco.FatalError, OSError,
+            RuntimeError, TypeError, ValueError) as error:
         raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; give a MuJoCo "
                         "task with continuous actions, or run: bash run_all.sh") from error
     env.reset(seed=seed)
