@@ -1464,7 +1464,8 @@ def parse_args(argv):
             sub.add_argument("--preset", choices=PRESETS, default=chosen.preset,
                              help="sizes; default: paper on CUDA, else small")
             sub.add_argument("--fresh", action="store_true", help="start over, do not resume")
-        add_config_flags(sub, used.split(), defaults)
+        if name in argv[:1]:  # reading Config's source takes 40 ms
+            add_config_flags(sub, used.split(), defaults)
     given, unknown = parser.parse_known_args(argv)
     if unknown:
         flags = [*commands.choices[given.command]._option_string_actions]
