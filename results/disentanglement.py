@@ -123,7 +123,7 @@ def measure(run, frames=2000, **changes):
     for name, encoder in encoders.items():
         if encoder:
             encoder = encoder.to(cfg.device)
-            codes = torch.cat([encoder(diswm.preprocess(part.to(cfg.device)))[0].cpu()
+            codes = torch.cat([encoder.encode(diswm.preprocess(part.to(cfg.device)))["mean"].cpu()
                                for part in torch.from_numpy(images).split(100)])
             scores, share = disentanglement(codes.numpy(), factors)
             result[name] = scores | dict(share=share.tolist())
