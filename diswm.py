@@ -1026,8 +1026,7 @@ def prepare_machine(cfg):
         raise UserError("there is no CUDA device; use --device cpu")
     torch.set_num_threads(min(cfg.threads or 1024, len(os.sched_getaffinity(0))))
     libc = ctypes.CDLL(None)
-    # Keep large buffers: to give them back to the kernel is 1.9× of a step.
-    libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
+    libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD; to give large buffers back is 1.9× of a step
     libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     return replace(cfg, device=device, precision=precision)
@@ -1089,7 +1088,7 @@ class Run:
                  unit, self.cfg.device, self.cfg.precision)
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
-        self.writer = SummaryWriter(self.folder, purge_step=begin + 1)
+        self.writer = SummaryWriter(self.folder, purge_step=begin + 1, flush_secs=5)
 
     def record(self, **row):
         """Log a row of metrics, and save a checkpoint."""
@@ -1099,7 +1098,6 @@ class Run:
         for name, value in row.items():
             if isinstance(value, (int, float)):
                 self.writer.add_scalar(name, value, done)
-        self.writer.flush()
         self.save()
         shown = ("train_return", "eval_return", "image", "reward", "kl", "disentangle", "eta")
         shown = "  ".join(f"{name} {row[name]:.4g}" for name in shown if name in row)
@@ -1431,7 +1429,7 @@ COMMANDS = dict(  # groups of Config's fields, and single ones, that are flags o
 class Parser(argparse.ArgumentParser):
     """argparse whose errors are one line."""
     def error(self, message):
-        raise UsageError(f"{message}; see: {self.prog} --help")
+        raise UsageError(f"{message}; {self.format_usage()}")
 
 def add_config_flags(parser, used, defaults):
     """Add flags for the fields of Config that are used, by its comments."""
@@ -1456,8 +1454,7 @@ def parse_args(argv):
     chosen.add_argument("--method", default="diswm")
     chosen, _ = chosen.parse_known_args(argv)
     defaults = replace(PRESETS.get(chosen.preset, Config()), **METHODS.get(chosen.method, {}))
-    parser = Parser(prog="diswm.py", description=(
-        "Disentangled World Models. Defaults without a source are of the published code."))
+    parser = Parser(prog="diswm.py", description="Defaults without a source are as published.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, used in COMMANDS.items():
         summary = globals()[name].__doc__.split("\n")[0]
@@ -1472,7 +1469,10 @@ def parse_args(argv):
             sub.add_argument("--fresh", action="store_true", help="start over, do not resume")
         if name in argv[:1]:  # reading Config's source takes 40 ms
             add_config_flags(sub, used.split(), defaults)
-    return vars(parser.parse_args(argv)), defaults
+    given, unknown = parser.parse_known_args(argv)
+    if unknown:
+        commands.choices[given.command].error(f"unknown: {' '.join(unknown)}")
+    return vars(given), defaults
 
 def main(argv=None):
     """Run a command. A user's mistake is one line and exit code 1 or 2. Returns the code."""
