@@ -124,8 +124,9 @@ class Config:
     imagine_starts: int = 0  # states of a batch to imagine from; 0: all (ours)
     gamma: float = 0.99  # discount γ (table)
     lambda_: float = 0.95  # λ of the λ-return (table)
+    actor: str = "squashed"  # tanh of a normal (ours); clipped: a normal around tanh
     rho: float = 1.0  # ρ: 1 dynamics backprop, 0 REINFORCE
-    entropy_scale: float = 1e-4  # weight of the actor's entropy
+    entropy_scale: float = 1e-3  # weight of the actor's entropy; published: 1e-4 (ours)
     actor_lr: float = 8e-5  # learning rate of the actor (table)
     critic_lr: float = 8e-5  # learning rate of the critic (table)
     slow_every: int = 100  # updates between copies of the critic
@@ -146,8 +147,8 @@ class Config:
 LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_delay=-1,
               batch_length=2)  # else a whole number is at least 1, any other at least 0
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
-               carry_over=("none", "weights", "stack"), device=("auto", "cpu", "cuda"),
-               precision=("auto", "fp32", "bf16"))
+               carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
+               device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
 MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads")  # of a run
 LOG_EVERY = 100  # updates of pretraining
 
@@ -160,7 +161,7 @@ PRESETS = {
     # For two CPU cores. A batch five times smaller wants a larger model_lr. η's clock shrinks
     # with the run, and η grows by 50 / 32, as Eq. (3) sums over time.
     "small": Config(
-        steps=100_000, collect_steps=20_000, pretrain_updates=1_000, prefill=1_000,
+        steps=100_000, collect_steps=20_000, pretrain_updates=1_000,
         fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
         cnn_depth=16, model_lr=1e-3, eta=0.156, eta_end=0.0156, eta_decay=5_000),
     "debug": Config(  # seconds, for tests: everything happens, nothing is learnt
@@ -878,9 +879,19 @@ class ActorCritic(nn.Module):
         self.slow_critic.load_state_dict(self.critic.state_dict())
 
     def policy(self, feat):
-        """The normal that actions come from, (..., A); its mean is in (−1, 1)."""
-        m, std = mean_std(self.actor(feat))
-        return torch.distributions.Normal(torch.tanh(m), std, validate_args=False)
+        """The normal that actions come from, by `squash`, (..., A)."""
+        # DEVIATION: published, a normal around tanh(m) that should be truncated and is not.
+        # Where |m| is large, nothing changes m again: ten of ten runs got stuck there.
+        mean, std = mean_std(self.actor(feat))
+        if self.cfg.actor == "clipped":
+            mean = torch.tanh(mean)
+        return torch.distributions.Normal(mean, std, validate_args=False)
+
+    def squash(self, x):
+        """A policy's sample or mean → an action in [−1, 1], and ln |da/dx|, (..., A) each"""
+        if self.cfg.actor == "clipped":
+            return clip_action(x), torch.zeros_like(x)
+        return torch.tanh(x), 2 * (math.log(2) - x - F.softplus(-2 * x))  # ln(1 − tanh² x)
 
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
@@ -894,11 +905,12 @@ class ActorCritic(nn.Module):
         for _ in range(self.cfg.horizon):
             # Its gradient comes from where the action leads, not from the state it sees.
             policy = self.policy(feats[-1].detach())
-            action = policy.rsample()
-            log_probs.append(policy.log_prob(action.detach()).sum(-1))  # REINFORCE's data
-            entropies.append(policy.entropy().sum(-1))
-            # DEVIATION: the published "truncated" normal is not; here actions are clipped.
-            state = model.rssm.prior(model.rssm.recur(state, clip_action(action)))
+            sample = policy.rsample()
+            action, slope = self.squash(sample)
+            log_prob = policy.log_prob(sample.detach()) - slope.detach()  # REINFORCE's data
+            log_probs.append(log_prob.sum(-1))
+            entropies.append((policy.entropy() + slope).sum(-1))
+            state = model.rssm.prior(model.rssm.recur(state, action))
             feats.append(model.rssm.feat(state))
         last = feats.pop()
         return torch.stack(feats), last, torch.stack(log_probs), torch.stack(entropies)
@@ -923,9 +935,27 @@ class ActorCritic(nn.Module):
         objective = (cfg.rho * target + (1 - cfg.rho) * log_prob * advantage
                      + cfg.entropy_scale * entropy)
         actor_loss = -(weight * objective).mean()
-        return actor_loss, critic_loss, dict(
+        return actor_loss, critic_loss, self.actor_metrics(feats[0]) | dict(
             actor=actor_loss, critic=critic_loss, actor_entropy=entropy.mean(),
             value=value.mean(), imagined_reward=reward.mean(), imagined_return=target.mean())
+
+    @torch.no_grad()
+    def actor_metrics(self, feat):
+        """Is the actor alive, and does it heed the state? Of states (N, S + D)."""
+        policy = self.policy(feat)
+        (mode, _), (action, _) = self.squash(policy.mean), self.squash(policy.sample())
+        return dict(actor_slope=(1 - mode**2).mean(), actor_std=policy.stddev.mean(),
+                    actor_spread=policy.mean.std(0).mean(),  # over states
+                    actor_saturated=(action.abs() > 0.99).float().mean())
+
+    @torch.no_grad()
+    def value_correlation(self, feats, rows):
+        """Of v(s_t) with the discounted return that came, over an episode's rows."""
+        value = self.critic(torch.cat(feats)).squeeze(-1)  # (T,)
+        reward, discount = (value.new_tensor([row[name] for row in rows[:len(value)]])
+                            for name in ("reward", "discount"))
+        came = lambda_return(reward, value, self.cfg.gamma * discount, value[-1], lambda_=1.0)
+        return torch.corrcoef(torch.stack([value, came]))[0, 1].nan_to_num().item()
 
 # === One update of all of them ===
 def autocast(cfg):  # 1.7× of a whole step at 50 × 50 on a CPU with native bf16
@@ -988,7 +1018,7 @@ class Agent(nn.Module):
         embed = self.model.encoder.encode(image)["embed"]
         state = rssm.step(state or rssm.initial(1), action, embed, is_first)
         policy = self.behaviour.policy(rssm.feat(state))
-        action = clip_action(policy.sample() if explore else policy.mean)
+        action, _ = self.behaviour.squash(policy.sample() if explore else policy.mean)
         return action[0].cpu().numpy(), state
 
     def update(self, batch, eta, index):
@@ -1176,12 +1206,13 @@ def train_agent(cfg, run, env, agent):
         phase, end = color_phase(cfg, done.env_steps)
         seed = derived_seed(cfg.seed, run.stage, done.episodes)
         torch.manual_seed(seed)  # of all noise, until the next episode
-        began, state, metrics = done.env_steps, None, []
+        began, state, feats, metrics = done.env_steps, None, [], []
         episode = Episode(env, seed, phase)  # 20
         while not episode.over and done.env_steps < end:  # 21: for t = 1 … T
             action = episode.random_action()
             if learning:
                 action, state = agent.act(episode.rows[-1], state, explore=True)  # 22
+                feats.append(agent.model.rssm.feat(state))
             done.env_steps += episode.step(action)  # 23
             done.decisions += 1
             if learning and done.decisions % cfg.train_every == 0:
@@ -1196,6 +1227,8 @@ def train_agent(cfg, run, env, agent):
         done.episodes += 1
         row = dict(step=done.env_steps, phase=phase, train_return=episode.total)
         row |= mean_metrics(metrics) | vars(done)
+        if feats:
+            row["value_correlation"] = agent.behaviour.value_correlation(feats, episode.rows)
         due = done.env_steps - done.env_steps % cfg.eval_every
         if due > began or done.env_steps >= cfg.steps:
             result, _ = evaluate_agent(cfg, env, agent, phase)
@@ -1203,9 +1236,9 @@ def train_agent(cfg, run, env, agent):
             row["eval_step"] = due if due > began else cfg.steps
         run.record(**row)
 
-def evaluate_agent(cfg, env, agent, phase):
-    """Play episodes, the same seeds every time, with the actor's mode or, agent None, at random
-    → dict of phase, return, std, returns, success; the last episode."""
+def evaluate_agent(cfg, env, agent, phase, explore=False):
+    """Play episodes, the same seeds every time, with the actor's mode, explore: its samples or,
+    agent None, at random → dict of phase, return, std, returns, success; the last episode."""
     # DEVIATION: the paper does not say in which colours; here, training's or metal.
     phase = "eval" if family(cfg.dst) == "drawer" else phase
     torch.manual_seed(cfg.seed)
@@ -1215,7 +1248,7 @@ def evaluate_agent(cfg, env, agent, phase):
         while not episode.over:
             action = episode.random_action()
             if agent:
-                action, state = agent.act(episode.rows[-1], state, explore=False)
+                action, state = agent.act(episode.rows[-1], state, explore)
             episode.step(action)
         returns.append(episode.total)
         successes.append(episode.success)
@@ -1323,9 +1356,12 @@ def evaluate(run, **changes):
         if env.action_space.shape != (agent.action_dim,):
             raise UserError(f"{run} has {agent.action_dim} actions, unlike {cfg.dst}")
         result, episode = evaluate_agent(cfg, env, agent, phase)
+        sampled, _ = evaluate_agent(cfg, env, agent, phase, explore=True)
         random, _ = evaluate_agent(cfg, env, None, phase)
-    log.info("%s, %s colours: return %.1f ± %.1f, random policy %.1f ± %.1f", cfg.dst,
-             result["phase"], result["return"], result["std"], random["return"], random["std"])
+    log.info("%s, %s colours: return %.1f ± %.1f, with samples %.1f ± %.1f, random policy "
+             "%.1f ± %.1f", cfg.dst, result["phase"], result["return"], result["std"],
+             sampled["return"], sampled["std"], random["return"], random["std"])
+    result |= {f"sampled_{name}": value for name, value in sampled.items()}
     result |= {f"random_{name}": value for name, value in random.items()}
     result |= dict(task=cfg.dst, step=step)
     frames = np.stack([row["image"] for row in episode.rows]).repeat(4, 1).repeat(4, 2)

@@ -37,7 +37,13 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from hypothesis import HealthCheck, example, given, settings, stateful
 from hypothesis import strategies as st
-from torch.distributions import Categorical, Normal, kl_divergence
+from torch.distributions import (
+    Categorical,
+    Normal,
+    TanhTransform,
+    TransformedDistribution,
+    kl_divergence,
+)
 
 import diswm
 from diswm import METHODS, PRESETS, TASKS, Config, Replay, UserError, make_env
@@ -324,21 +330,24 @@ def test_clipped_actions_stay_in_bounds_and_keep_their_gradient(values):
     assert torch.equal(torch.autograd.grad(clipped.sum(), action)[0], torch.ones(len(values)))
 
 
-def test_acted_and_imagined_actions_stay_inside_the_bounds():
+@pytest.mark.parametrize("actor", diswm.CHOICES["actor"])
+def test_acted_and_imagined_actions_stay_inside_the_bounds(actor):
     """The published "truncated" normal is not truncated: its actions leave [−1, 1]."""
-    agent, images = make_agent(tiny_config(horizon=5)), fake_batch(1, 32)["image"][0]
+    cfg, images = tiny_config(horizon=5, actor=actor), fake_batch(1, 32)["image"][0]
+    agent = make_agent(cfg)
     rows = [dict(image=image, action=np.zeros(2, np.float32)) for image in images]
     acted = np.stack([agent.act(row, None, explore=True)[0] for row in rows])
-    assert acted.shape == (32, 2) and acted.dtype == np.float32 and (np.abs(acted) < 1).all()
+    assert acted.shape == (32, 2) and acted.dtype == np.float32 and (np.abs(acted) <= 1).all()
     rssm, recur, seen = agent.model.rssm, agent.model.rssm.recur, []
     rssm.recur = lambda state, action: seen.append(action.detach()) or recur(state, action)
     agent.behaviour.imagine(agent.model, rssm.initial(32))
-    assert len(seen) == 5 and (torch.stack(seen).abs() < 1).all()
+    assert len(seen) == 5 and (torch.stack(seen).abs() <= 1).all()
 
 
-def test_evaluation_takes_the_actors_mode():
-    """Mode = tanh(m), the policy's mean, without noise; the state of the filter goes on."""
-    agent, state = make_agent(tiny_config()), None
+@pytest.mark.parametrize("actor", diswm.CHOICES["actor"])
+def test_evaluation_takes_the_actors_mode(actor):
+    """Mode = tanh(m) of either actor, without noise; the state of the filter goes on."""
+    agent, state = make_agent(tiny_config(actor=actor)), None
     row = dict(image=fake_batch(1, 1)["image"][0, 0], action=np.zeros(2, np.float32))
     for _ in range(3):
         before, (action, state) = state, agent.act(row, state, explore=False)
@@ -567,10 +576,11 @@ def test_rho_chooses_between_dynamics_backprop_and_reinforce(rho):
     assert torch.autograd.grad(critic, feats, allow_unused=True)[0] is None
 
 
-def test_imagination_follows_the_policy_from_the_given_states_for_horizon_transitions():
+@pytest.mark.parametrize("actor", diswm.CHOICES["actor"])
+def test_imagination_follows_the_policy_from_the_given_states_for_horizon_transitions(actor):
     """States s_0 … s_H, log-probs and entropies of a_0 … a_{H−1}, by torch.distributions. The last
     state's gradient reaches all of the actor: action → state. For the policy states are data."""
-    agent, taken = make_agent(tiny_config(horizon=4)), []
+    agent, taken = make_agent(tiny_config(horizon=4, actor=actor)), []
     behaviour, rssm, recur = agent.behaviour, agent.model.rssm, agent.model.rssm.recur
     start = {key: torch.randn_like(x) for key, x in rssm.initial(5).items()}
     rssm.recur = lambda state, action: taken.append((state, action)) or recur(state, action)
@@ -579,12 +589,17 @@ def test_imagination_follows_the_policy_from_the_given_states_for_horizon_transi
     expected = torch.stack([torch.cat([s["stoch"], s["deter"]], -1) for s in states])
     assert torch.equal(feats, expected) and len(feats) == 4
     m, s = behaviour.actor(feats).chunk(2, -1)
-    policy = Normal(torch.tanh(m), 2 * torch.sigmoid(s / 2) + 0.1)
-    torch.testing.assert_close(entropy, policy.entropy().sum(-1))
-    action = torch.stack([action for _, action in taken])
-    inside = (action.abs() < 0.999).all(-1)  # others were clipped
+    std, action = 2 * torch.sigmoid(s / 2) + 0.1, torch.stack([action for _, action in taken])
+    inside = (action.abs() < 0.99).all(-1)  # others were clipped, or rounded
+    policy = Normal(torch.tanh(m), std)
+    if actor == "squashed":  # its entropy is −E ln π, estimated by the sample
+        policy = TransformedDistribution(Normal(m, std), TanhTransform())
+        expected = Normal(m, std).entropy() + torch.log1p(-action**2)
+    else:
+        expected = policy.entropy()
+    torch.testing.assert_close(entropy[inside], expected.sum(-1)[inside], rtol=1e-3, atol=1e-3)
     expected = policy.log_prob(action).sum(-1)[inside]
-    torch.testing.assert_close(log_prob[inside], expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(log_prob[inside], expected, rtol=1e-3, atol=1e-3)
     gradients = torch.autograd.grad(last.sum(), list(behaviour.actor.parameters()),
                                     retain_graph=True)
     assert len(expected) > 3 and all(gradient.any() for gradient in gradients)
@@ -599,13 +614,38 @@ LINE = SimpleNamespace(  # a toy world model: a point on a line that an action m
                          recur=lambda state, action: state["deter"] + action))
 
 
-@pytest.mark.parametrize("rho", [1.0, 0.0])
-def test_an_actor_learns_to_do_what_a_known_reward_asks_for(rho):
-    """By either gradient: six decisions by the mode from nine places come close to the best ones,
-    which are known, and were far below."""
+class Constant(torch.nn.Module):
+    """An actor that heeds no state: m, and 0 for its std."""
+    def __init__(self, m):
+        super().__init__()
+        self.m = torch.nn.Parameter(torch.tensor([m]))
+
+    def forward(self, feat):
+        return torch.cat([self.m, 0 * self.m]).expand(*feat.shape[:-1], 2)
+
+
+@given(st.floats(1, 20), st.sampled_from([-1, 1]))
+def test_an_actor_on_the_wrong_side_always_learns_that_it_is(size, side):
+    """However large |m|: the derivative of Eq. (5)'s objective never falls below the entropy's."""
+    cfg = tiny_config(stoch=1, deter=1, horizon=3)
+    torch.manual_seed(0)
+    behaviour, model = diswm.ActorCritic(cfg, 1), SimpleNamespace(**vars(LINE))
+    model.reward = lambda feat: -side * feat[..., 1:]  # go the other way
+    behaviour.actor = Constant(side * size)
+    start = LINE.rssm.prior(torch.zeros(256, 1))
+    loss, _, _ = behaviour.losses(model, start, torch.full((256,), 0.9))
+    gradient, = torch.autograd.grad(loss, behaviour.actor.m)
+    assert side * gradient.item() > cfg.entropy_scale / 2
+
+
+@pytest.mark.parametrize("rho, push", [(1.0, 0), (0.0, 0), (1.0, 8), (1.0, -8)])
+def test_an_actor_learns_to_do_what_a_known_reward_asks_for(rho, push):
+    """By either gradient, and from an actor that pushes to one side in every state: six decisions
+    by the mode from nine places come close to the best ones, and were far below (−70, −120)."""
     cfg = tiny_config(stoch=1, deter=1, horizon=5, rho=rho, units=32)
     torch.manual_seed(0)
     behaviour = diswm.ActorCritic(cfg, 1)
+    behaviour.actor.net[-1].bias.data[0] += push
 
     def play(decide):
         place, total = torch.linspace(-1, 1, 9)[:, None], 0.0
@@ -615,16 +655,19 @@ def test_an_actor_learns_to_do_what_a_known_reward_asks_for(rho):
             total += LINE.reward(torch.cat([place, place], -1)).mean().item()
         return total
 
-    before, best = play(lambda f: behaviour.policy(f).mean), play(lambda f: 0.6 - f[:, 1:])
+    def mode(feat):
+        return behaviour.squash(behaviour.policy(feat).mean)[0]
+
+    before, best = play(mode), play(lambda f: 0.6 - f[:, 1:])
     actor, critic = (diswm.adam(net, 3e-3) for net in (behaviour.actor, behaviour.critic))
-    for update in range(200):
+    for update in range(400 if push else 200):
         if update % 10 == 0:
             behaviour.slow_critic.load_state_dict(behaviour.critic.state_dict())
         start = LINE.rssm.prior(2 * torch.rand(64, 1) - 1)
         actor_loss, critic_loss, _ = behaviour.losses(LINE, start, torch.full((64,), 0.9))
         diswm.descend(actor_loss, actor, 100.0)
         diswm.descend(critic_loss, critic, 100.0)
-    assert before < best - 2 and play(lambda f: behaviour.policy(f).mean) > best - 0.5
+    assert before < best - 2 and play(mode) > best - (3 if push else 0.5)
 
 
 @pytest.mark.parametrize("still", ["model", "actor", "critic"])
@@ -1033,6 +1076,12 @@ def teacher_trained_too(real, z_disen, z_task):
     return (log_p.exp() * (log_p - log_q)).sum((-1, -2)).mean()
 
 
+def the_old_actor(real, behaviour, feat):
+    """The published normal around tanh(m)."""
+    behaviour.cfg = dataclasses.replace(behaviour.cfg, actor="clipped")
+    return real(behaviour, feat)
+
+
 def free_nats_first(real, post, prior, balance, free_nats):
     """Free nats on every step, before the mean."""
     value = real(post, prior, balance, free_nats)[1]
@@ -1071,11 +1120,17 @@ METHOD_BUGS = {  # name: what is patched; the bug; the tests that must fail, and
         "lambda_return", lambda real, r, v, d, b, l: real(r, v, d * 0 + 0.99, b, l),
         returns, losses),
     "actions that learn nothing from where they lead": (
-        "clip_action", lambda real, action: real(action).detach(),
-        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0)),
+        "ActorCritic.squash", lambda real, self, x: tuple(y.detach() for y in real(self, x)),
+        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0, 0)),
+    "the old actor, which one side can hold for good": (
+        "ActorCritic.policy", the_old_actor,
+        (test_an_actor_on_the_wrong_side_always_learns_that_it_is, 20.0, 1)),
+    "the old actor, which starts at one side": (
+        "ActorCritic.policy", the_old_actor,
+        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0, 8)),
     "unclipped action": (
         "clip_action", lambda real, action: action,
-        (test_acted_and_imagined_actions_stay_inside_the_bounds,)),
+        (test_acted_and_imagined_actions_stay_inside_the_bounds, "clipped")),
     "plain clamp of an action": (
         "clip_action", lambda real, action: action.clamp(1e-6 - 1, 1 - 1e-6),
         (test_clipped_actions_stay_in_bounds_and_keep_their_gradient, [-9.0, 0.5, 9.0])),
@@ -1803,7 +1858,8 @@ def test_first_updates_wait_until_all_prefill_episodes_are_in_the_replay(cut, tm
 
 TERMS = {
     "image", "reward", "discount", "kl_loss", "kl", "disentangle", "distill", "eta", "actor",
-    "critic", "actor_entropy", "value", "imagined_reward", "imagined_return", "model_grad_norm",
+    "critic", "actor_entropy", "actor_slope", "actor_spread", "actor_std", "actor_saturated",
+    "value_correlation", "value", "imagined_reward", "imagined_return", "model_grad_norm",
     "actor_grad_norm", "critic_grad_norm", "train_return", "eval_return", "eval_std", "rate"}
 COLLECTED = "collect/cheetah_run/dreamerv2/seed0"
 PRETRAINED = "pretrain/cheetah_run/diswm/seed0"
@@ -1859,7 +1915,7 @@ def test_pipeline_evaluates_and_draws(finished, teacher, root):
     out = succeed("evaluate", *ONE, "--run", finished)
     result = json.loads((finished / "evaluation.json").read_text())
     assert (result["task"], result["phase"], result["step"]) == ("walker_walk", "shifted", 300)
-    for name in ("", "random_"):
+    for name in ("", "sampled_", "random_"):
         returns = result[f"{name}returns"]
         assert len(returns) == 2 and result[f"{name}return"] == pytest.approx(np.mean(returns))
         assert result[f"{name}std"] == pytest.approx(np.std(returns))
