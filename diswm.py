@@ -313,7 +313,8 @@ class DistractingEnv(gym.Wrapper):
                  color_range=0.2, fast_render=False, size=64):
         super().__init__(env)
         model, self.data = self.unwrapped.model, self.unwrapped.data
-        self.phase, self.action_repeat, self.rng = phase, action_repeat, np.random.default_rng()
+        self.phase, self.action_repeat = phase, action_repeat
+        self.rng = np.random.default_rng()
         self.groups = color_groups(task, model)
         self.original = [array[rows, :3] for array, rows in self.groups]  # copies
         original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
@@ -353,7 +354,8 @@ class DistractingEnv(gym.Wrapper):
             total, steps, over = total + reward, steps + 1, terminated or truncated
             reached += [info[key] for key in ("success", "is_success") if key in info]
         success = dict(success=any(reached)) if reached else {}
-        return self.render(), total, terminated, truncated, info | success | dict(env_steps=steps)
+        info = info | success | dict(env_steps=steps)
+        return self.render(), total, terminated, truncated, info
 
     def render(self):
         if hasattr(self.unwrapped, "_render_callback"):  # puts Fetch's goal
@@ -476,7 +478,8 @@ class Replay:
     def add(self, rows):
         """Append a finished episode, a list of dicts with the fields of `dtype`."""
         fields, file = self.dtype.names, io.BytesIO()
-        np.save(file, np.array([tuple(row[name] for name in fields) for row in rows], self.dtype))
+        rows = [tuple(row[name] for name in fields) for row in rows]
+        np.save(file, np.array(rows, self.dtype))
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{len(self.paths):06d}.npy"
         write_whole(path, file.getbuffer())
@@ -624,7 +627,7 @@ class BiasGradient(torch.autograd.Function):
         return grad, grad.sum((0, 2, 3))
 
 class Deconvolution(nn.ConvTranspose2d):
-    """Its own backward sums the bias's gradient slowly; with channels last, 12 % of a step."""
+    """Its own backward sums the bias's gradient slowly: 12 % of a step."""
     def forward(self, x):
         bias = self.bias.detach()
         y = F.conv_transpose2d(x, self.weight, bias, self.stride, self.padding)
@@ -645,7 +648,8 @@ class BetaVAEEncoder(PerFrame):
     def encode(self, image):
         """→ dict of `embed`, a draw of 𝐳, and its `mean` and `logvar`, (..., Z) each"""
         mean, logvar = self(image).chunk(2, -1)
-        return dict(embed=gaussian_sample(mean, (logvar / 2).exp()), mean=mean, logvar=logvar)
+        embed = gaussian_sample(mean, (logvar / 2).exp())
+        return dict(embed=embed, mean=mean, logvar=logvar)
 
 class BetaVAEDecoder(PerFrame):
     """Decoder of Eqs. (1), (4): feat (..., S + D), a neck as narrow as 𝐳 → (..., 3, 64, 64)."""
@@ -847,7 +851,8 @@ class WorldModel(VideoPredictor):
 
     def frame_losses(self, out, batch):
         """Those of Eq. (2), reward, discount: dict of (B, T). Last rows have no bonus."""
-        losses, feat, reward = super().frame_losses(out, batch), out["feat"], batch["reward"]
+        losses = super().frame_losses(out, batch)
+        feat, reward = out["feat"], batch["reward"]
         # DEVIATION: the discount head of Eq. (4) is trained; the published code has it off.
         logit, target = self.discount(feat).squeeze(-1), self.cfg.gamma * batch["discount"]
         losses["discount"] = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
@@ -880,8 +885,7 @@ class ActorCritic(nn.Module):
 
     def policy(self, feat):
         """The normal that actions come from, by `squash`, (..., A)."""
-        # DEVIATION: published, a normal around tanh(m) that should be truncated and is not.
-        # Where |m| is large, nothing changes m again: ten of ten runs got stuck there.
+        # DEVIATION: published, a normal around tanh(m): ten of ten runs got stuck.
         mean, std = mean_std(self.actor(feat))
         if self.cfg.actor == "clipped":
             mean = torch.tanh(mean)
@@ -891,7 +895,8 @@ class ActorCritic(nn.Module):
         """A policy's sample or mean → an action in [−1, 1], and ln |da/dx|, (..., A) each"""
         if self.cfg.actor == "clipped":
             return clip_action(x), torch.zeros_like(x)
-        return torch.tanh(x), 2 * (math.log(2) - x - F.softplus(-2 * x))  # ln(1 − tanh² x)
+        slope = 2 * (math.log(2) - x - F.softplus(-2 * x))  # ln(1 − tanh² x)
+        return torch.tanh(x), slope
 
     def imagine(self, model, start):
         """Follow the policy through the world model's prior, H transitions from N states.
@@ -1172,7 +1177,8 @@ def train_video_predictor(cfg, run, videos):
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
         torch.manual_seed(rng.integers(2**63))  # of all noise
-        batch = to_device(videos.sample(cfg.batch_size, cfg.batch_length, rng), cfg.device)  # 5
+        batch = videos.sample(cfg.batch_size, cfg.batch_length, rng)  # 5
+        batch = to_device(batch, cfg.device)
         with autocast(cfg):
             loss, terms = model.loss(model(batch), batch)  # 6, 7: Eq. (2)
         terms["model_grad_norm"] = descend(loss, optimizer, cfg.grad_clip)
@@ -1248,7 +1254,7 @@ def evaluate_agent(cfg, env, agent, phase, explore=False):
         while not episode.over:
             action = episode.random_action()
             if agent:
-                action, state = agent.act(episode.rows[-1], state, explore)
+                action, state = agent.act(episode.rows[-1], state, explore=explore)
             episode.step(action)
         returns.append(episode.total)
         successes.append(episode.success)
@@ -1358,9 +1364,9 @@ def evaluate(run, **changes):
         result, episode = evaluate_agent(cfg, env, agent, phase)
         sampled, _ = evaluate_agent(cfg, env, agent, phase, explore=True)
         random, _ = evaluate_agent(cfg, env, None, phase)
-    log.info("%s, %s colours: return %.1f ± %.1f, with samples %.1f ± %.1f, random policy "
-             "%.1f ± %.1f", cfg.dst, result["phase"], result["return"], result["std"],
-             sampled["return"], sampled["std"], random["return"], random["std"])
+    log.info("%s, %s colours", cfg.dst, result["phase"])
+    for name, played in (("mode", result), ("samples", sampled), ("random", random)):
+        log.info("%s: return %.1f ± %.1f", name, played["return"], played["std"])
     result |= {f"sampled_{name}": value for name, value in sampled.items()}
     result |= {f"random_{name}": value for name, value in random.items()}
     result |= dict(task=cfg.dst, step=step)
