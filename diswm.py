@@ -940,7 +940,7 @@ class ActorCritic(nn.Module):
         objective = (cfg.rho * target + (1 - cfg.rho) * log_prob * advantage
                      + cfg.entropy_scale * entropy)
         actor_loss = -(weight * objective).mean()
-        return actor_loss, critic_loss, self.actor_metrics(feats[0]) | dict(
+        return actor_loss, critic_loss, self.actor_metrics(feats[0, :64]) | dict(
             actor=actor_loss, critic=critic_loss, actor_entropy=entropy.mean(),
             value=value.mean(), imagined_reward=reward.mean(), imagined_return=target.mean())
 
