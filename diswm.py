@@ -627,7 +627,7 @@ class BiasGradient(torch.autograd.Function):
         return grad, grad.sum((0, 2, 3))
 
 class Deconvolution(nn.ConvTranspose2d):
-    """Its own backward sums the bias's gradient slowly: 12 % of a step."""
+    """Its own backward sums the bias's gradient slowly."""
     def forward(self, x):
         bias = self.bias.detach()
         y = F.conv_transpose2d(x, self.weight, bias, self.stride, self.padding)
@@ -803,7 +803,7 @@ class VideoPredictor(nn.Module):
             embed_dim = 32 * cfg.cnn_depth
             self.encoder = ConvEncoder(cfg.cnn_depth)
             self.decoder = ConvDecoder(feat_dim, cfg.cnn_depth)
-        self.decoder.to(memory_format=torch.channels_last)
+        self.decoder.to(memory_format=torch.channels_last)  # with Deconvolution 12 % of a step
         rssm = StackedRSSM if cfg.carry_over == "stack" and action_dim else RSSM
         self.rssm = rssm(action_dim, embed_dim, cfg.stoch, cfg.deter, cfg.hidden)
         self.weights = dict(image=1.0, kl_loss=cfg.beta1, disentangle=cfg.beta2)
@@ -885,7 +885,7 @@ class ActorCritic(nn.Module):
 
     def policy(self, feat):
         """The normal that actions come from, by `squash`, (..., A)."""
-        # DEVIATION: published, a normal around tanh(m): ten of ten runs got stuck.
+        # DEVIATION: published, a normal around tanh(m): ten of ten cartpole runs began stuck.
         mean, std = mean_std(self.actor(feat))
         if self.cfg.actor == "clipped":
             mean = torch.tanh(mean)
@@ -1352,7 +1352,7 @@ def finetune(cfg, fresh=False):
     return run.folder
 
 def evaluate(run, **changes):
-    """Play episodes with a run's policy and a random one, to JSON and mp4 (stage 4)."""
+    """Play a run's policy by mode and by samples, and a random one, to JSON and mp4 (stage 4)."""
     cfg, agent, saved = open_run(run / "checkpoint.pt", **changes)
     if not isinstance(agent, Agent):
         raise UserError(f"{run} is a video predictor without a policy; give a finetune run")
