@@ -26,6 +26,7 @@ import contextlib
 import ctypes
 import difflib
 import fcntl
+import hashlib
 import inspect
 import io
 import json
@@ -69,6 +70,7 @@ class Config:
     """The comments are the flags' help. Values are of the paper's (table) or, by default, of the
     published configuration. A *decision* is an action, held for `action_repeat` env steps."""
     # --- run: what, where it is kept, how long
+    preset: str = "paper"  # sizes; without CUDA: small (ours)
     src: str = "cheetah_run"  # task of the distracting videos (paper)
     dst: str = "walker_walk"  # target task (paper)
     method: str = "diswm"  # the paper's method, a baseline or an ablation (paper)
@@ -146,10 +148,12 @@ class Config:
 
 LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_delay=-1,
               batch_length=2)  # else a whole number is at least 1, any other at least 0
-CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
-               carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
-               device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
-MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads")  # of a run
+CHOICES = dict(preset=("paper", "small", "debug"), colors=("published", "original"),
+               encoder=("beta_vae", "conv"), carry_over=("none", "weights", "stack"),
+               actor=("squashed", "clipped"), device=("auto", "cpu", "cuda"),
+               precision=("auto", "fp32", "bf16"))
+MAY_CHANGE = ("preset", "runs", "teacher", "videos", "device", "precision", "threads")  # of a run
+MAY_GROW = ("steps", "collect_steps", "pretrain_updates", "eval_episodes")
 LOG_EVERY = 100  # updates of pretraining
 
 def flag_name(name):
@@ -161,14 +165,14 @@ PRESETS = {
     # For two CPU cores. A batch five times smaller wants a larger model_lr. η's clock shrinks
     # with the run, and η grows by 50 / 32, as Eq. (3) sums over time.
     "small": Config(
-        steps=100_000, collect_steps=20_000, pretrain_updates=1_000,
+        preset="small", steps=100_000, collect_steps=20_000, pretrain_updates=1_000,
         fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
         cnn_depth=16, model_lr=1e-3, eta=0.156, eta_end=0.0156, eta_decay=5_000),
     "debug": Config(  # seconds, for tests: everything happens, nothing is learnt
-        steps=300, collect_steps=200, pretrain_updates=20, prefill=50, first_updates=2,
-        threads=1, train_every=10, eval_every=100, eval_episodes=2, time_limit=50, batch_size=3,
-        batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12, hidden=10, units=10, eta=0.6,
-        eta_end=0.06, eta_decay=60, slow_every=5),
+        preset="debug", steps=300, collect_steps=200, pretrain_updates=20, prefill=50,
+        first_updates=2, threads=1, train_every=10, eval_every=100, eval_episodes=2,
+        time_limit=50, batch_size=3, batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12,
+        hidden=10, units=10, eta=0.6, eta_end=0.06, eta_decay=60, slow_every=5),
 }
 NO_DISTILL, NO_BETA = dict(eta=0.0, eta_end=0.0), dict(beta=0.0, beta2=0.0)
 # DEVIATION: Gaussian latents in all methods; those of DreamerV2 and APV were discrete.
@@ -444,9 +448,9 @@ def reading(path, kind, remedy="start over with --fresh"):
     """What damaged or foreign content raises becomes one line."""
     try:
         yield
-    except (UserError, MemoryError):
-        raise
     except Exception as error:  # numpy, torch, pickle and zipfile have their own
+        if type(error) in (UserError, MemoryError):  # not UsageError: a Config's, in the file
+            raise
         cause = f"{type(error).__name__}: {error}".split("\n")[0][:120]
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from error
 
@@ -1084,19 +1088,35 @@ class Run:
     """A run's folder, which `start` makes. Colours, η and all seeds follow from the counts in
     `done`, so that no checkpoint needs a simulator or a random state."""
     def __init__(self, cfg, stage, fresh=False):
-        self.cfg, self.stage, self.fresh, self.log = cfg, stage, fresh, ""
+        self.cfg, self.stage, self.fresh, self.log, self.inputs = cfg, stage, fresh, "", {}
         self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0)
         self.folder = run_folder(cfg, stage)
         self.resumes = (self.folder / "checkpoint.pt").exists() and not fresh
         if self.resumes:
             self.saved = read_checkpoint(self.folder / "checkpoint.pt")
-            self.log, old, new = self.saved["log"], vars(self.saved["config"]), vars(cfg)
+            self.log, self.inputs = self.saved["log"], self.saved.get("inputs", {})
             vars(self.done).update(self.saved["done"])
-            differ = [f"{flag_name(name)} {old[name]} (now {new[name]})" for name in new
-                      if old[name] != new[name] and name not in MAY_CHANGE]
+            # What was trained keeps its colours: after how many steps they changed, as a share.
+            old, new = (vars(c) | dict(switch=min(round(c.switch * c.steps), self.done.env_steps)
+                                       / cfg.steps) for c in (self.saved["config"], cfg))
+            differ = [name for name in new if old[name] != new[name] and name not in MAY_CHANGE
+                      and not (name in MAY_GROW and old[name] < new[name])]
+            if differ and old["preset"] != new["preset"]:
+                differ = ["preset"]  # it explains the others
+            differ = [f"{flag_name(name)} {old[name]} (now {new[name]})" for name in differ]
             if differ:
-                raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the "
-                                "same flags, or --fresh to start over, or another --runs")
+                raise UserError(f"{self.folder} was started with {', '.join(differ)}; add these "
+                                "flags, or --fresh to start over, or another --runs")
+
+    def check_input(self, name, path, files):
+        """Note files that decide the result, by content: a run goes on with the same alone."""
+        contents = [hashlib.sha256(np.memmap(file, mode="r")).digest() for file in files]
+        digest = hashlib.sha256(b"".join(contents)).hexdigest()[:12]
+        now = f"{flag_name(name)} {path} of sha256 {digest}"
+        before = self.inputs.setdefault(name, now)
+        if before[-12:] != now[-12:]:
+            raise UserError(f"{self.folder} was started with {before}, not {now}; give the one it "
+                            "was started with, or --fresh to start over, or another --runs")
 
     def start(self, unit, total, **parts):
         """Make and lock the folder. parts (with a state_dict) go on from its checkpoint."""
@@ -1147,7 +1167,7 @@ class Run:
         state = {name: part.state_dict() for name, part in self.parts.items()}
         finished = getattr(self.done, self.unit) >= self.total
         torch.save(dict(config=config, stage=self.stage, log=self.log, done=vars(self.done),
-                        finished=finished) | state, file)
+                        finished=finished, inputs=self.inputs) | state, file)
         write_whole(self.folder / "config.json", json.dumps(config, indent=2).encode())
         write_whole(self.folder / "metrics.jsonl", self.log.encode())
         write_whole(self.folder / "checkpoint.pt", file.getbuffer())
@@ -1172,7 +1192,7 @@ def train_video_predictor(cfg, run, videos):
     optimizer = adam(model, cfg.model_lr)
     run.start("updates", cfg.pretrain_updates, model=model, optimizer=optimizer)
     shown = Replay(run.folder / "episodes")
-    if not shown.paths:  # one video stays with the run, for `traverse`
+    if videos and not shown.paths:  # one video stays with the run, for `traverse`
         shown.add(videos.read(videos.paths[-1]))
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
@@ -1190,7 +1210,7 @@ def train_video_predictor(cfg, run, videos):
 
 def color_phase(cfg, env_steps):
     """The phase of an episode that begins then, and the env step at which it must end."""
-    switch = int(cfg.switch * cfg.steps)  # once, at the midpoint
+    switch = round(cfg.switch * cfg.steps)  # once, at the midpoint
     return ("train", switch) if env_steps < switch else ("shifted", cfg.steps)
 
 def current_eta(cfg, decisions):
@@ -1302,7 +1322,7 @@ def find_teacher(cfg):
         if getattr(own, name) != getattr(cfg, name):
             raise UserError(f"{path} does not fit; add {flag_name(name)} {getattr(own, name)}")
     log.info("teacher: %s", path)
-    return video
+    return path, video
 
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1)."""
@@ -1320,6 +1340,9 @@ def pretrain(cfg, fresh=False):
     check_task(cfg.src)
     cfg = replace(cfg, dst=cfg.src)
     run = Run(cfg, "pretrain", fresh)
+    if run.done.updates >= cfg.pretrain_updates and not os.path.exists(cfg.videos):
+        train_video_predictor(cfg, run, None)  # says so, and needs none
+        return run.folder
     folder = cfg.videos
     if not folder:
         found = finished_runs(run_folder(replace(cfg, method="dreamerv2"), "collect"))
@@ -1329,6 +1352,7 @@ def pretrain(cfg, fresh=False):
         raise UserError(f"{folder} has {videos.bounds[-1]} frames in *.npy, a window takes "
                         f"{cfg.batch_length}; run: python diswm.py collect --src {cfg.src}")
     log.info("videos: %s, %d episodes, %d frames", folder, len(videos.paths), videos.bounds[-1])
+    run.check_input("videos", folder, videos.paths)
     train_video_predictor(cfg, run, videos)
     return run.folder
 
@@ -1339,8 +1363,9 @@ def finetune(cfg, fresh=False):
     if cfg.src == cfg.dst:
         raise UserError(f"source and target are both {cfg.src}; choose another --src")
     run, video = Run(cfg, "finetune", fresh), None
-    if not run.resumes and (cfg.eta > 0 or cfg.carry_over != "none"):
-        video = find_teacher(cfg)
+    if (cfg.eta > 0 or cfg.carry_over != "none") and (cfg.teacher or not run.resumes):
+        path, video = find_teacher(cfg)
+        run.check_input("teacher", path, [path])
     with config_env(cfg, cfg.dst) as env:
         torch.manual_seed(cfg.seed)  # of the weights
         agent = Agent(cfg, *env.action_space.shape)
@@ -1459,12 +1484,12 @@ def doctor(tasks=FAMILIES):
     draw_grid(pictures, tasks, PHASES, "doctor.png")
 
 # === Command line ===
-COLLECT = "src seed runs collect_steps environment acting models behaviour machine "
+COLLECT = "preset src seed runs collect_steps environment acting models behaviour machine "
 COMMANDS = dict(  # groups of Config's fields, and single ones, that are flags of each
     collect=COLLECT,
     pretrain=COLLECT + "method videos pretrain_updates encoder z_dim beta1 beta2",
-    finetune="src dst method seed runs teacher steps switch environment acting models encoder "
-             "carry_over bonus z_dim beta distillation behaviour machine",
+    finetune="preset src dst method seed runs teacher steps switch environment acting models "
+             "encoder carry_over bonus z_dim beta distillation behaviour machine",
     evaluate="dst seed environment eval_episodes device threads",
     traverse="seed device threads", doctor="")
 
@@ -1506,8 +1531,6 @@ def parse_args(argv):
         elif name in ("evaluate", "traverse"):
             sub.add_argument("--run", type=Path, required=True, help="its folder: runs/…/seed0")
         else:
-            sub.add_argument("--preset", choices=PRESETS, default=chosen.preset,
-                             help="sizes; default: paper on CUDA, else small")
             sub.add_argument("--fresh", action="store_true", help="start over, do not resume")
         if name in argv[:1]:  # reading Config's source takes 40 ms
             add_config_flags(sub, used.split(), defaults)
@@ -1522,8 +1545,8 @@ def main(argv=None):
     try:
         given, defaults = parse_args(sys.argv[1:] if argv is None else argv)
         command = globals()[given.pop("command")]
-        if "preset" in given:
-            log.info("preset %s", given.pop("preset"))
+        if "fresh" in given:
+            log.info("preset %s", defaults.preset)
             fresh = given.pop("fresh")
             given = dict(cfg=prepare_machine(replace(defaults, **given)), fresh=fresh)
         command(**given)

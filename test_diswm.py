@@ -1782,7 +1782,7 @@ def test_finetuning_leaves_its_teacher_as_it_was_and_goes_on_without_it_bit_for_
         gc.collect()  # the lock goes with the run
         assert video.read_bytes() == source.read_bytes()
         video.unlink()
-        state = torch.load(diswm.finetune(cfg) / "checkpoint.pt")
+        state = torch.load(diswm.finetune(dataclasses.replace(cfg, teacher="")) / "checkpoint.pt")
         ends.append(state["agent"])
     agent, resumed = ends
     assert state["done"]["updates"] > 5 and agent.keys() == resumed.keys()
@@ -1950,7 +1950,58 @@ def test_other_flags_are_refused_with_their_names(copied, tmp_path):
         str(copied), "--beta 0.015 (now 0.5)", "--lambda 0.95 (now 0.5)", "--fresh"))
     refuse("evaluate", "--run", copied, "--dst", "cartpole_swingup", says="6 actions")
     assert all_files(copied) == before
-    succeed(*argv, "--threads", 2, "--teacher", "elsewhere.pt")
+    refuse("finetune", "--runs", tmp_path, *DEBUG[2:], "--preset", "small",
+           says="was started with --preset debug (now small); add")
+    succeed(*argv, "--threads", 2)
+
+
+def test_a_run_goes_on_for_more_steps_but_its_trained_colors_stay(tmp_path):
+    """A finished run asked for more equals one that was asked for it at once. Where the switch is
+    behind it, --switch, a share of more steps now, has to say where it was."""
+    def trained(name, **changes):
+        cfg = tiny_config("dreamerv2", steps=100, eval_episodes=1)
+        return everything(train_fake(dataclasses.replace(cfg, **changes),
+                                     tmp_path / name).run.folder)
+    for switch, longer in ((1.0, 1.0), (0.5, 0.25)):
+        trained(f"{switch}", switch=switch)
+        if switch < 1:
+            with pytest.raises(UserError, match=r"--switch 0.25 \(now 0.5\)"):
+                trained(f"{switch}", steps=200)
+        with pytest.raises(UserError, match=r"--steps 100 \(now 90\)"):
+            trained(f"{switch}", switch=switch, steps=90)
+        more = trained(f"{switch}", steps=200, switch=longer)
+        assert more["done"]["env_steps"] == 200 and more["done"]["updates"] > 5
+        assert_identical(more, trained("at once", steps=200, switch=longer))
+        shutil.rmtree(tmp_path / "at once")
+
+
+def test_videos_and_teacher_are_known_by_content_and_may_not_change(
+        root, teacher, copied, tmp_path):
+    """The bugs it kills: a run went on with other videos and mixed both; another teacher was
+    accepted, and the first one kept. Their folder may move, and what has finished needs none."""
+    ours, other = tmp_path / "ours", tmp_path / "other"
+    shutil.copytree(root / "runs" / COLLECTED / "episodes", ours)
+    shutil.copytree(ours, other)
+    rows = np.load(other / "000001.npy")
+    rows["image"][5, 5, 5] ^= 1
+    np.save(other / "000001.npy", rows)
+    argv = ("pretrain", "--runs", tmp_path, *DEBUG, "--pretrain-updates")
+    interrupt(diswm, "descend", 9, (*argv, 20, "--videos", ours))
+    refuse(*argv, 20, "--videos", other, says=(
+        f"started with --videos {ours} of sha256 ", f", not --videos {other} of sha256 "))
+    moved = ours.rename(tmp_path / "moved")
+    succeed(*argv, 20, "--videos", moved)
+    for videos in (other, tmp_path / "collect/cheetah_run"):
+        refuse(*argv, 21, "--videos", videos, says=str(videos))
+    shutil.rmtree(moved)
+    assert "at 20 of 20 updates" in succeed(*argv, 20) + succeed(*argv, 20, "--videos", moved)
+    assert not (tmp_path / "collect").exists()
+    path, argv = tmp_path / "teacher.pt", ("finetune", "--runs", tmp_path, *DEBUG, "--teacher")
+    refuse(*argv, path, says="no checkpoint")
+    shutil.copy(teacher, path)
+    succeed(*argv, path)
+    refuse(*argv, tmp_path / PRETRAINED / "checkpoint.pt", says=(
+        f"started with --teacher {teacher} of", f"not --teacher {tmp_path / PRETRAINED}"))
 
 
 def test_a_collect_cut_off_goes_on_whatever_pretraining_is_to_follow(tmp_path):
@@ -2186,6 +2237,7 @@ def everything(run):
     assert state.pop("log") == (run / "metrics.jsonl").read_text()
     config = state.pop("config").items()
     return state | dict(
+        inputs={name: said[-12:] for name, said in state["inputs"].items()},  # no paths
         config={name: value for name, value in config if name not in diswm.MAY_CHANGE},
         rows=[{name: value for name, value in row.items() if name not in ("seconds", "rate")}
               for row in log_rows(run)],
@@ -2458,7 +2510,8 @@ def test_file_that_is_no_checkpoint_of_ours_is_refused(teacher, tmp_path):
     cuts = [whole[:length] for length in np.linspace(1, len(whole) - 1, 20, dtype=int)]
     for content in (b"", b"PK\x03\x04 not a zip", b"hello\n" * 99, b"\x80\x02.", *cuts,
                     {"weight": torch.ones(2)}, (1, 2), torch.ones(3), {"config": 3},
-                    ours | dict(config=ours["config"] | dict(envs=1)), ours | dict(model={})):
+                    ours | dict(config=ours["config"] | dict(envs=1)), ours | dict(model={}),
+                    ours | dict(config=ours["config"] | dict(gamma=-1.0))):
         if isinstance(content, bytes):
             path.write_bytes(content)
         else:
