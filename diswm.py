@@ -184,7 +184,8 @@ METHODS = dict(  # sets of Config values; all run through the same code
 
 # === Tasks and distractors (sections 2 and 4) ===
 vars(np).setdefault("in1d", np.isin)  # dropped by NumPy 2.4, called by dm_control
-TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
+TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS
+         if domain != "lqr"}  # whose actions have no bounds
 OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
 PHASES = ("train", "shifted", "eval", "none")
 # DEVIATION: around these, as published; the paper says around the original ones.
@@ -201,16 +202,18 @@ def check_task(task):
         return
     with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice
         import gymnasium_robotics  # noqa: F401  registers its tasks
-    if task not in gym.registry:
-        near = difflib.get_close_matches(task, [*known, *gym.registry]) or ["none"]
+    others = [name for name in gym.registry if not name.startswith("DisWM/")]
+    if task not in others:
+        near = difflib.get_close_matches(task, [*known, *others]) or ["none"]
         raise UsageError(f"unknown task '{task}'; near: {' '.join(near)}; all: {' '.join(known)} "
                          "and MuJoCo tasks of gymnasium, gymnasium-robotics")
 
 class DMControlEnv(gym.Env):
     """A task of dm_control.suite as a gymnasium.Env, with nothing observed."""
     def __init__(self, domain, task):
-        self.env = suite.load(domain, task, dict(random=0))
+        self.env = suite.load(domain, task, dict(random=0, time_limit=math.inf))
         self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr
+        self.metadata = dict(render_fps=1 / self.env.control_timestep())
         spec = self.env.action_spec()
         self.action_space = gym.spaces.Box(np.float32(spec.minimum), np.float32(spec.maximum))
 
@@ -257,6 +260,7 @@ def drawer_world(task):
     env = DrawerWorld()
     # Draw a goal at each reset, from the seed; its own benchmark sets one of a list.
     env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
+    env.max_path_length = math.inf  # make_env limits the time
     # DEVIATION: published from 0.96 above, where half of this drawer is out of sight.
     env.mujoco_renderer.default_cam_config = dict(
         distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
@@ -311,7 +315,8 @@ def color_groups(task, model):
 class DistractingEnv(gym.Wrapper):
     """A simulator in colours drawn for each episode; reset(options={"phase": …}) changes their
     phase. By mujoco.Renderer: simulators that render() show each other's textures."""
-    metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
+    render_mode = "rgb_array"
+    spec = property(lambda self: self.unwrapped.spec)  # of make_env, wrappers and all
 
     def __init__(self, env, task, phase, *, action_repeat=2, colors="published",
                  color_range=0.2, fast_render=False, size=64):
@@ -319,6 +324,8 @@ class DistractingEnv(gym.Wrapper):
         model, self.data = self.unwrapped.model, self.unwrapped.data
         self.phase, self.action_repeat = phase, action_repeat
         self.rng = np.random.default_rng()
+        fps = (env.metadata.get("render_fps") or 25) / action_repeat  # decisions a second
+        self.metadata = make_env.metadata | dict(render_fps=fps)
         self.groups = color_groups(task, model)
         self.original = [array[rows, :3] for array, rows in self.groups]  # copies
         original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
@@ -339,11 +346,14 @@ class DistractingEnv(gym.Wrapper):
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])  # not the simulator's
         self.phase = (options or {}).get("phase", self.phase)
+        if self.phase not in PHASES:
+            raise UsageError(f"unknown phase '{self.phase}'; there are: {', '.join(PHASES)}")
         colors = self.original
         if self.phase != "none":
             colors = self.rng.uniform(*self.boxes[self.phase])
         for (array, rows), color in zip(self.groups, colors, strict=True):
             array[rows, :3] = color
+        mujoco.mj_resetData(self.unwrapped.model, self.data)  # a hand's own reset leaves some
         _, info = self.env.reset(seed=seed, options=dict(phase=self.phase))
         for index in range(self.unwrapped.model.nhfield):
             self.renderer._gl_context.make_current()  # quadruped's terrain is new
@@ -374,13 +384,11 @@ class DistractingEnv(gym.Wrapper):
         self.renderer.close()
         super().close()
 
-def make_env(task, *, phase="train", seed=0, time_limit=0, **settings):
+def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **settings):
     """A gymnasium.Env with actions in [−1, 1] and uint8 images. time_limit: simulator steps, 0:
     the task's own. phase: "train", "shifted" (after the midpoint), "eval" (drawers: metal;
     others: as shifted), "none" (the task's own look)."""
     check_task(task)
-    if phase not in PHASES:
-        raise UsageError(f"unknown phase '{phase}'; there are: {', '.join(PHASES)}")
     try:
         env, limit = bare_simulator(task)
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
@@ -392,8 +400,9 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, **settings):
     env.reset(seed=seed)
     return env
 
+make_env.metadata = dict(render_modes=["rgb_array"])  # what gymnasium.make looks at
 for name in (*TASKS, *OTHER_TASKS):
-    gym.register(f"DisWM/{name}-v0", make_env, kwargs=dict(task=name))
+    gym.register(f"DisWM/{name}-v0", f"{__name__}:make_env", kwargs=dict(task=name))
 
 def config_env(cfg, task):
     """make_env with the values of a Config."""
@@ -1226,6 +1235,9 @@ def train_agent(cfg, run, env, agent):
     if replay.paths and not (run.resumes or run.fresh):
         raise UserError(f"{run.folder} has episodes and no checkpoint; start over with --fresh")
     run.start("env_steps", cfg.steps, agent=agent, replay=replay, **agent.optimizers)
+    if cfg.steps < (cfg.prefill + cfg.train_every) * cfg.action_repeat:
+        log.info("warning: --steps %d end before the first update; --prefill is %d decisions of "
+                 "%d steps", cfg.steps, cfg.prefill, cfg.action_repeat)
     while done.env_steps < cfg.steps:  # 10: while not converged
         # 9: random episodes, until all that the first updates are to see is there.
         learning = done.decisions >= cfg.prefill and replay.bounds[-1] >= cfg.batch_length
@@ -1396,8 +1408,9 @@ def evaluate(run, **changes):
     result |= {f"random_{name}": value for name, value in random.items()}
     result |= dict(task=cfg.dst, step=step)
     frames = np.stack([row["image"] for row in episode.rows]).repeat(4, 1).repeat(4, 2)
-    iio.imwrite(run / "evaluation.mp4", frames, fps=25)  # 256 × 256
-    (run / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
+    video = iio.imwrite("<bytes>", frames, extension=".mp4", fps=25)  # 256 × 256
+    write_whole(run / "evaluation.mp4", video)
+    write_whole(run / "evaluation.json", json.dumps(result, indent=2).encode())
     return result
 
 # === Figures: traverse and doctor ===
@@ -1529,7 +1542,8 @@ def parse_args(argv):
         if name == "doctor":
             sub.add_argument("tasks", nargs="*", metavar="TASK", default=FAMILIES)
         elif name in ("evaluate", "traverse"):
-            sub.add_argument("--run", type=Path, required=True, help="its folder: runs/…/seed0")
+            sub.add_argument("--run", type=lambda path: Path(path.removesuffix("checkpoint.pt")),
+                             required=True, help="its folder: runs/…/seed0")
         else:
             sub.add_argument("--fresh", action="store_true", help="start over, do not resume")
         if name in argv[:1]:  # reading Config's source takes 40 ms
@@ -1553,10 +1567,10 @@ def main(argv=None):
         return 0
     except UserError as error:
         message, code = str(error), 2 if isinstance(error, UsageError) else 1
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         message, code = f"{error}; mend that and run the same command again", 1
     except KeyboardInterrupt:
-        message, code = "interrupted; the same command goes on from the last checkpoint", 130
+        message, code = "interrupted; the same command goes on, training from its checkpoint", 130
     print("error:", " ".join(message.split()), file=sys.stderr)
     return code
 

@@ -1541,9 +1541,11 @@ def test_planted_action_repeat_bug_is_noticed(weights, monkeypatch):
 
 @pytest.mark.parametrize("task, given, repeat, limit", [
     ("walker_walk", 7, 2, 7), ("walker_walk", 0, 30, 1000), ("pusher", 0, 30, 100),
-    ("drawer_open", 0, 30, 200), ("FetchReach-v4", 0, 30, 50), ("HalfCheetah-v5", 8, 2, 8)])
+    ("drawer_open", 0, 30, 200), ("FetchReach-v4", 0, 30, 50), ("HalfCheetah-v5", 8, 2, 8),
+    ("walker_walk", 1010, 30, 1010), ("drawer_open", 510, 30, 510)])
 def test_time_limit_counts_env_steps_and_is_no_terminal(task, given, repeat, limit):
-    """By default the task's own. A repeat that it cuts short counts the steps that were made."""
+    """By default the task's own. A repeat that it cuts short counts the steps that were made. The
+    bug it kills: a limit above the simulator's own was cut to that, unsaid."""
     with make_env(task, time_limit=given, action_repeat=repeat) as env:
         env.reset(seed=0)
         steps, over = 0, False
@@ -1551,6 +1553,31 @@ def test_time_limit_counts_env_steps_and_is_no_terminal(task, given, repeat, lim
             *_, terminated, truncated, info = env.step(env.action_space.sample())
             steps, over = steps + info["env_steps"], terminated or truncated
     assert steps == limit and truncated and not terminated
+
+
+@pytest.mark.parametrize("task", [*diswm.FAMILIES, "HandManipulateBlock-v1"])
+def test_an_episode_leaves_nothing_behind_for_the_next(task):
+    """A resumed run has played none before. The bug it kills: the hand's warm start stayed."""
+    with make_env(task) as env, make_env(task) as fresh:
+        env.reset(seed=5)
+        for _ in range(15):
+            env.step(env.action_space.sample())
+        for rows in zip(play(env, 3), play(fresh, 3), strict=True):
+            assert np.array_equal(rows[0][0], rows[1][0]) and rows[0][1:] == rows[1][1:]
+
+
+def test_gymnasium_finds_its_conventions_kept():
+    """render_mode, decisions per simulated second, a spec that goes through JSON, and an unknown
+    phase is named. Bugs, all of them, if they fail."""
+    settings = dict(phase="shifted", action_repeat=4, size=32)
+    with gym.make("DisWM/walker_walk-v0", render_mode="rgb_array", **settings) as env:
+        assert env.render_mode == "rgb_array" and env.metadata["render_fps"] == pytest.approx(10)
+        picture, spec = env.reset(seed=1)[0], gym.envs.registration.EnvSpec.from_json(
+            env.spec.to_json())
+        with pytest.raises(UserError, match="'nigth'.*train, shifted, eval, none"):
+            env.reset(options=dict(phase="nigth"))
+    with gym.make(spec) as env:
+        assert np.array_equal(env.reset(seed=1)[0], picture)
 
 
 def test_ten_envs_alive_at_once_do_not_mix_textures():
@@ -1840,6 +1867,17 @@ def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
         assert eta == pytest.approx(expected)
 
 
+def test_a_run_too_short_for_an_update_warns_at_its_start(tmp_path, caplog):
+    """The bug it kills: it ended as if all were well. 50 decisions of prefill, 10 to an update."""
+    with caplog.at_level("INFO", "diswm"):
+        for steps, warned in ((118, True), (120, False)):
+            caplog.clear()
+            run = train_fake(tiny_config("dreamerv2", steps=steps, eval_episodes=1), tmp_path,
+                             fresh=True).run
+            assert ("warning: --steps" in caplog.messages[1]) == warned, caplog.messages[:3]
+            assert (run.done.updates == 0) == warned
+
+
 @pytest.mark.parametrize("cut", [1, 2, 3, 99])
 def test_first_updates_wait_until_all_prefill_episodes_are_in_the_replay(cut, tmp_path):
     """The bug it kills: with 20 random decisions in episodes of 10, learning began before the
@@ -1912,7 +1950,7 @@ def test_pipeline_logs_every_loss_term_counts_env_steps_and_switches_once(finish
 
 def test_pipeline_evaluates_and_draws(finished, teacher, root):
     """pretrain → finetune → evaluate → traverse on real DMC leaves files that open."""
-    out = succeed("evaluate", *ONE, "--run", finished)
+    out = succeed("evaluate", *ONE, "--run", finished / "checkpoint.pt")
     result = json.loads((finished / "evaluation.json").read_text())
     assert (result["task"], result["phase"], result["step"]) == ("walker_walk", "shifted", 300)
     for name in ("", "sampled_", "random_"):
@@ -2051,6 +2089,9 @@ def test_evaluate_plays_as_it_was_trained_but_for_what_it_is_given(copied):
         returns[(step, *flags)] = json.loads((copied / "evaluation.json").read_text())["returns"]
     assert [len(values) for values in returns.values()] == [2, 3, 2]
     assert len({values[0] for values in returns.values()}) == 3
+    before = all_files(copied)
+    interrupt(iio, "imwrite", 1, ("evaluate", *ONE, "--run", copied))
+    assert all_files(copied) == before
 
 
 @pytest.mark.parametrize("method", ["dreamerv2", "no_distill"])
@@ -2471,6 +2512,8 @@ def test_nan_stops_the_run_by_name_and_saves_nothing(loss, broken, term, root, u
     ("finetune --dst walker_wlak", "unknown walker_walk cartpole_swingup"),
     ("pretrain --src drawer", "unknown drawer_open"),
     ("finetune --dst HalfCheeta-v5 --method dreamerv2", "near: HalfCheetah-v5"),
+    ("finetune --dst DisWM/drawer_open-v0", "near: drawer_open"),
+    ("collect --src lqr_lqr_2_1", "unknown lqr_lqr_2_1"),
     ("collect --src FetchReach", "near: FetchReach-v4"), ("finetune --dst qqq", "near: none"),
     ("finetune --batchsize 1", "--batchsize --batch-size"), ("evaluate", "--run"), ("", "COMMAND"),
     ("collect walker_walk", "walker_walk --src --preset"), ("finetune --qqq", "--qqq --batch-size"),
@@ -2487,6 +2530,23 @@ def test_wrong_usage_exits_2_and_lists_what_is_near(argv, says, workdir, monkeyp
     monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
     refuse(*argv.split(), code=2, says=says.split())
     assert not list(workdir.iterdir())
+
+
+def test_a_name_that_is_not_utf8_is_one_line(tmp_path):
+    """The bug it kills: a traceback of TensorBoard."""
+    refuse("collect", "--runs", os.fsdecode(bytes(tmp_path) + b"/\xff"), *DEBUG, says="utf-8")
+
+
+@pytest.mark.parametrize("flags", [(), ("-I",)], ids=["beside a diswm.py", "isolated"])
+def test_a_copy_under_another_name_runs_itself(flags, tmp_path):
+    """People copy a single file to change it. The bug it kills: the last lines imported `diswm`."""
+    source = Path(diswm.__file__).read_text()
+    assert source.count("Learn in the distracting source task") == 1
+    (tmp_path / "mine.py").write_text(source.replace("distracting source task", "changed copy"))
+    (tmp_path / "diswm.py").write_text("raise SystemExit('the other file')")
+    done = subprocess.run([sys.executable, "-W", "ignore", *flags, tmp_path / "mine.py", "--help"],
+                          capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "") and "Learn in the changed copy" in done.stdout
 
 
 def test_checkpoint_with_a_payload_is_refused_and_not_executed(teacher, tmp_path, monkeypatch):
