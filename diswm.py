@@ -88,6 +88,7 @@ class Config:
     colors: str = "published"  # boxes around fixed centres or the original colours (paper)
     color_range: float = 0.2  # half width of a box, RGB in 0..1
     fast_render: bool = False  # no anti-aliasing, about twice as fast (ours)
+    camera: str = ""  # name of a camera of the task's; empty: one that shows it well (ours)
     # --- acting, and how often to learn
     prefill: int = 2500  # decisions at random before learning
     first_updates: int = 100  # updates right after prefill
@@ -212,6 +213,9 @@ class DMControlEnv(gym.Env):
     """A task of dm_control.suite as a gymnasium.Env, with nothing observed."""
     def __init__(self, domain, task):
         self.env = suite.load(domain, task, dict(random=0, time_limit=math.inf))
+        class Physics(type(self.env.physics)):
+            contexts = None  # else quadruped's reset makes a GL context that spoils ours
+        self.env.physics.__class__ = Physics
         self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr
         self.metadata = dict(render_fps=1 / self.env.control_timestep())
         spec = self.env.action_spec()
@@ -261,9 +265,6 @@ def drawer_world(task):
     # Draw a goal at each reset, from the seed; its own benchmark sets one of a list.
     env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
     env.max_path_length = math.inf  # make_env limits the time
-    # DEVIATION: published from 0.96 above, where half of this drawer is out of sight.
-    env.mujoco_renderer.default_cam_config = dict(
-        distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
     return env
 
 def bare_simulator(task):
@@ -272,22 +273,38 @@ def bare_simulator(task):
         return DMControlEnv(*TASKS[task]), 1000
     if family(task) == "drawer":
         return drawer_world(task), 200
-    if task == "pusher":  # as published
-        above = dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2))
-        return gym.make("Pusher-v5", default_camera_config=above).unwrapped, 100
+    if task == "pusher":
+        return gym.make("Pusher-v5").unwrapped, 100
     env = gym.make(task, disable_env_checker=True).unwrapped
     return env, gym.spec(task).max_episode_steps or 1000
 
-def find_camera(env):
-    """dm_control's first one; gymnasium's own choice: "track", else a free one."""
-    if isinstance(env, DMControlEnv):
-        return 0
-    camera = mujoco.mj_name2id(env.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
-    if camera < 0:
-        camera = mujoco.MjvCamera()
-        mujoco.mjv_defaultFreeCamera(env.model, camera)
-        for name, value in (env.mujoco_renderer.default_cam_config or {}).items():
-            setattr(camera, name, value)
+CAMERAS = dict(  # a task's beginning → its camera's name, or values of a free one
+    quadruped="y", dog_fetch="y-axis", cartpole_three_poles="lookatcart", lqr="cam1",
+    PointMaze=dict(elevation=-90),  # else its walls hide it
+    Reacher=dict(distance=0.65, elevation=-90, lookat=(0, 0, 0)),
+    InvertedDoublePendulum=dict(distance=4, elevation=-10, lookat=(0, 0, 0.6)),
+    pusher=dict(distance=2, elevation=-90, lookat=(0, -0.5, 0.2)),  # as published
+    # DEVIATION: published from 0.96 above, where half of this drawer is out of sight.
+    drawer=dict(distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0)))
+CLOSER = ("acrobot", "ball_in_cup", "fish", "pendulum", "swimmer_swimmer15")  # else < 1 % moves
+
+def find_camera(env, task, name=""):
+    """The named one, that of CAMERAS, or the usual: dm_control's first; gymnasium's choice."""
+    names = [env.model.camera(index).name for index in range(env.model.ncam)]
+    if name and name not in names:
+        raise UsageError(f"no camera '{name}'; {task} has: {', '.join(names) or 'none'}")
+    views = [CAMERAS[start] for start in CAMERAS if task.startswith(start)]
+    views += [n for n in names if isinstance(env, DMControlEnv) or n == "track"] + [{}]
+    view = name or views[0]
+    if view in names:
+        if task.startswith(CLOSER) and not name:
+            env.model.cam_fovy[0] *= 0.82
+        return view
+    camera, own = mujoco.MjvCamera(), vars(getattr(env, "mujoco_renderer", env))
+    mujoco.mj_kinematics(env.model, env.data)
+    values = dict(lookat=np.median(env.data.geom_xpos, 0), distance=env.model.stat.extent)
+    for field, value in (values | (own.get("default_cam_config") or {}) | view).items():
+        setattr(camera, field, value)
     return camera
 
 def color_box(phase, original, colors="published", half_range=0.2):
@@ -319,7 +336,7 @@ class DistractingEnv(gym.Wrapper):
     spec = property(lambda self: self.unwrapped.spec)  # of make_env, wrappers and all
 
     def __init__(self, env, task, phase, *, action_repeat=2, colors="published",
-                 color_range=0.2, fast_render=False, size=64):
+                 color_range=0.2, fast_render=False, camera="", size=64):
         super().__init__(env)
         model, self.data = self.unwrapped.model, self.unwrapped.data
         self.phase, self.action_repeat = phase, action_repeat
@@ -332,7 +349,7 @@ class DistractingEnv(gym.Wrapper):
         self.boxes = {p: color_box(p, original, colors, color_range) for p in COLOR_CENTERS}
         if task == "pusher":  # its object is black
             self.boxes = {p: np.array(box) * [[0], [1], [1]] for p, box in self.boxes.items()}
-        self.camera = find_camera(self.unwrapped)
+        self.camera = find_camera(self.unwrapped, task, camera)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
         # DEVIATION: small shadow maps (20–60 % of a frame's time), no mirrors (12 %): < 0.6 / 255.
         model.vis.quality.shadowsize = 512
@@ -340,6 +357,7 @@ class DistractingEnv(gym.Wrapper):
             model.vis.quality.offsamples = 0  # half of the rest, for 1–2 / 255
         self.renderer = mujoco.Renderer(model, size, size)
         self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self.renderer._scene_option.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER] = 0  # rays
         atexit.register(self.renderer.close)  # else errors at exit
 
     def reset(self, *, seed=None, options=None):
@@ -394,6 +412,8 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **s
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         env = gym.wrappers.TimeLimit(env, time_limit or limit)
         env = DistractingEnv(env, task, phase, **settings)
+    except UserError:
+        raise
     except Exception as error:  # simulators and OpenGL have many of their own
         raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; give a MuJoCo "
                         "task with continuous actions, or run: bash run_all.sh") from error
@@ -406,7 +426,7 @@ for name in (*TASKS, *OTHER_TASKS):
 
 def config_env(cfg, task):
     """make_env with the values of a Config."""
-    names = ("action_repeat", "time_limit", "colors", "color_range", "fast_render")
+    names = ("action_repeat", "time_limit", "colors", "color_range", "fast_render", "camera")
     return make_env(task, **{name: getattr(cfg, name) for name in names})
 
 # === Episodes and the replay buffer ===

@@ -1429,6 +1429,74 @@ def test_each_phase_looks_different_and_none_is_the_task_as_it_is(task):
         assert max(np.abs(view - none)[30:36, :12].mean() for view in views) < 10
 
 
+def moving_share(env):
+    """Which part of the picture is of bodies that can move, by MuJoCo's segmentation."""
+    model, renderer = env.unwrapped.model, env.renderer
+    renderer.enable_segmentation_rendering()
+    renderer.update_scene(env.unwrapped.data, camera=env.camera)
+    index, kind = np.moveaxis(renderer.render(), -1, 0)
+    renderer.disable_segmentation_rendering()
+    moves = kind == mujoco.mjtObj.mjOBJ_SKIN
+    for name, bodies in (("GEOM", model.geom_bodyid), ("SITE", model.site_bodyid)):
+        drawn = kind == mujoco.mjtObj.__members__["mjOBJ_" + name]
+        moves[drawn] = model.body_weldid[bodies[index[drawn]]] != 0
+    return moves.mean()
+
+
+def has_its_agent_in_the_picture(task):
+    """Whether at least 1 % of the picture can move: the mean of four episodes' beginnings. Dots
+    that roam a large arena are at least there: closer, the camera would lose their goal."""
+    dots = task.startswith(("point_mass", "lqr_lqr_2_1", "PointMaze"))
+    with make_env(task, phase="none") as env:
+        shares = []
+        for seed in range(4):
+            rows = play(env, seed, 0 if dots else 10 * seed)
+            shares += [moving_share(env) for _ in rows][::10]
+        return np.mean(shares) >= (0.0004 if dots else 0.01)
+
+
+@pytest.mark.parametrize("task", [
+    "acrobot_swingup", "ball_in_cup_catch", "cartpole_three_poles", "fish_swim", "lqr_lqr_2_1",
+    "pendulum_swingup", "quadruped_run", "swimmer_swimmer15", "Reacher-v5", "HalfCheetah-v5",
+    "InvertedDoublePendulum-v5", "PointMaze_UMaze-v3", "pusher", "drawer_close"])
+def test_the_agent_is_in_the_picture(task):
+    """The quadruped had 9 of 4096 pixels, gymnasium's Reacher one, PointMaze was refused."""
+    assert has_its_agent_in_the_picture(task)
+
+
+@slow
+def test_the_agent_is_in_the_picture_of_every_task():
+    """Every task of the suite, and the newest version of each gymnasium and robotics id."""
+    diswm.check_task("FetchReach-v4")  # registers the robotics ids
+    specs = sorted(gym.registry.values(), key=lambda spec: spec.version or 0)
+    newest = {spec.name: spec for spec in specs if "Dense" not in spec.name and
+              re.search(r"gymnasium(\.envs\.mujoco|_robotics)", str(spec.entry_point))}
+    tasks = [*TASKS, *diswm.OTHER_TASKS, *(spec.id for spec in newest.values())]
+    assert len(tasks) > 90
+    assert not [task for task in tasks if not has_its_agent_in_the_picture(task)]
+
+
+@pytest.mark.parametrize("name, differs", [("side", False), ("back", True)])
+def test_camera_names_one_of_the_tasks_cameras(name, differs):
+    """walker_walk's first camera is "side"; another shows it from there, and no other task."""
+    with make_env("walker_walk") as usual, make_env("walker_walk", camera=name) as env:
+        assert (usual.render() != env.render()).any() == differs
+
+
+def test_quadruped_escape_shows_no_rays_and_its_terrain_spoils_no_other_picture():
+    """Rays covered the picture; and dm_control made a GL context of its own for the terrain, which
+    outlived close(), so that later environments showed garbage."""
+    with make_env("walker_walk") as env:
+        before = env.render()
+    with make_env("quadruped_escape") as escape:
+        scene = escape.renderer.scene
+        assert mujoco.mjtGeom.mjGEOM_LINE not in [g.type for g in scene.geoms[:scene.ngeom]]
+        assert escape.unwrapped.env.physics._contexts is None
+    for _ in range(3):
+        with make_env("walker_walk") as env:
+            assert np.array_equal(env.render(), before)
+
+
 @pytest.mark.parametrize("task", ["drawer_open", "drawer_close", "FetchReach-v4"])
 def test_first_picture_shows_what_the_reset_has_placed(task):
     """Meta-World moves the drawer, Fetch its goal, but MuJoCo drew them where they had been."""
