@@ -27,6 +27,7 @@ import ctypes
 import difflib
 import fcntl
 import hashlib
+import importlib
 import inspect
 import io
 import json
@@ -40,7 +41,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's own choice needs a display
+os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"  # headless
 
 import gymnasium as gym
 import imageio.v3 as iio
@@ -50,12 +51,6 @@ import torch.nn.functional as F
 from torch import nn
 from tqdm import tqdm
 
-try:
-    import mujoco
-    from dm_control import suite
-except (AttributeError, ImportError) as error:  # how a missing libEGL or libOSMesa shows
-    sys.exit(f"error: MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; run: bash run_all.sh test")
-
 log = logging.getLogger("diswm")  # only the command line prints
 
 class UserError(Exception):
@@ -63,6 +58,20 @@ class UserError(Exception):
 
 class UsageError(UserError):
     """A wrong flag, value or task: the exit code is 2."""
+
+class OpenGLError(SystemExit, UserError):
+    """The import fails: one line without a traceback for those who do not catch it."""
+
+try:
+    import mujoco
+    importlib.reload(mujoco.gl_context)  # an earlier import did not see MUJOCO_GL
+    from dm_control import suite
+except (AttributeError, ImportError, RuntimeError) as error:  # a missing libEGL, a wrong value
+    raise OpenGLError(f"error: MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; export MUJOCO_GL=egl "
+                      "and run: bash run_all.sh test") from error
+
+PROCESS = os.getpid()
+mujoco.Renderer._gl_context = mujoco.Renderer._mjr_context = None  # one that fails can close
 
 # === Config ===
 @dataclass(frozen=True)
@@ -407,6 +416,8 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **s
     the task's own. phase: "train", "shifted" (after the midpoint), "eval" (drawers: metal;
     others: as shifted), "none" (the task's own look)."""
     check_task(task)
+    if os.getpid() != PROCESS:
+        raise UserError('OpenGL would hang in a forked process; start it with context="spawn"')
     try:
         env, limit = bare_simulator(task)
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
@@ -415,8 +426,8 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **s
     except UserError:
         raise
     except Exception as error:  # simulators and OpenGL have many of their own
-        raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; give a MuJoCo "
-                        "task with continuous actions, or run: bash run_all.sh") from error
+        raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; export "
+                        "MUJOCO_GL=egl, or give a MuJoCo task with continuous actions") from error
     env.reset(seed=seed)
     return env
 
@@ -501,7 +512,8 @@ class Replay:
 
     def read(self, path):
         """An episode's rows, mapped into memory. UserError at wrong fields."""
-        with reading(path, f"episode with {', '.join(self.dtype.names)}", "remove it"):
+        with reading(path, f"episode with {', '.join(self.dtype.names)}",
+                     "convert videos by: python results/import_videos.py FROM TO"):
             rows = np.load(path, mmap_mode="r", allow_pickle=False)
             good = all(rows.dtype[name] == self.dtype[name] for name in self.dtype.names)
             if not good or rows.ndim != 1 or len(rows) == 0:
@@ -1222,7 +1234,7 @@ def train_video_predictor(cfg, run, videos):
     run.start("updates", cfg.pretrain_updates, model=model, optimizer=optimizer)
     shown = Replay(run.folder / "episodes")
     if videos and not shown.paths:  # one video stays with the run, for `traverse`
-        shown.add(videos.read(videos.paths[-1]))
+        shown.add(videos.read(videos.paths[-1])[-1000:])  # however long
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
         torch.manual_seed(rng.integers(2**63))  # of all noise
@@ -1382,7 +1394,8 @@ def pretrain(cfg, fresh=False):
     videos = Replay(folder)
     if videos.bounds[-1] < cfg.batch_length:
         raise UserError(f"{folder} has {videos.bounds[-1]} frames in *.npy, a window takes "
-                        f"{cfg.batch_length}; run: python diswm.py collect --src {cfg.src}")
+                        f"{cfg.batch_length}; run: python diswm.py collect --src {cfg.src}, or "
+                        "convert videos by: python results/import_videos.py FROM TO")
     log.info("videos: %s, %d episodes, %d frames", folder, len(videos.paths), videos.bounds[-1])
     run.check_input("videos", folder, videos.paths)
     train_video_predictor(cfg, run, videos)

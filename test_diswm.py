@@ -14,6 +14,7 @@ import inspect
 import io
 import itertools
 import json
+import multiprocessing
 import os
 import re
 import runpy
@@ -1444,12 +1445,12 @@ def moving_share(env):
 
 
 def has_its_agent_in_the_picture(task):
-    """Whether at least 1 % of the picture can move: the mean of four episodes' beginnings. Dots
+    """Whether at least 1 % of the picture can move: the mean of three episodes' beginnings. Dots
     that roam a large arena are at least there: closer, the camera would lose their goal."""
-    dots = task.startswith(("point_mass", "lqr_lqr_2_1", "PointMaze"))
+    dots = task.startswith(("point_mass", "lqr", "PointMaze"))
     with make_env(task, phase="none") as env:
         shares = []
-        for seed in range(4):
+        for seed in range(3):
             rows = play(env, seed, 0 if dots else 10 * seed)
             shares += [moving_share(env) for _ in rows][::10]
         return np.mean(shares) >= (0.0004 if dots else 0.01)
@@ -1457,8 +1458,8 @@ def has_its_agent_in_the_picture(task):
 
 @pytest.mark.parametrize("task", [
     "acrobot_swingup", "ball_in_cup_catch", "cartpole_three_poles", "fish_swim", "lqr_lqr_2_1",
-    "pendulum_swingup", "quadruped_run", "swimmer_swimmer15", "Reacher-v5", "HalfCheetah-v5",
-    "InvertedDoublePendulum-v5", "PointMaze_UMaze-v3", "pusher", "drawer_close"])
+    "pendulum_swingup", "quadruped_run", "swimmer_swimmer15", "Reacher-v5",
+    "InvertedDoublePendulum-v5", "PointMaze_UMaze-v3"])
 def test_the_agent_is_in_the_picture(task):
     """The quadruped had 9 of 4096 pixels, gymnasium's Reacher one, PointMaze was refused."""
     assert has_its_agent_in_the_picture(task)
@@ -1476,11 +1477,14 @@ def test_the_agent_is_in_the_picture_of_every_task():
     assert not [task for task in tasks if not has_its_agent_in_the_picture(task)]
 
 
-@pytest.mark.parametrize("name, differs", [("side", False), ("back", True)])
-def test_camera_names_one_of_the_tasks_cameras(name, differs):
-    """walker_walk's first camera is "side"; another shows it from there, and no other task."""
-    with make_env("walker_walk") as usual, make_env("walker_walk", camera=name) as env:
-        assert (usual.render() != env.render()).any() == differs
+def test_camera_names_one_of_the_tasks_cameras(tmp_path):
+    """walker_walk's first camera is "side"; "back" is another, and what is none says which are."""
+    with make_env("walker_walk") as usual:
+        for name, differs in (("side", False), ("back", True)):
+            with make_env("walker_walk", camera=name) as env:
+                assert (usual.render() != env.render()).any() == differs
+    refuse("collect", "--src", "walker_walk", "--camera", "front", "--runs", tmp_path, *DEBUG,
+           code=2, says="no camera 'front'; walker_walk has: side, back")
 
 
 def test_quadruped_escape_shows_no_rays_and_its_terrain_spoils_no_other_picture():
@@ -1683,6 +1687,50 @@ if __name__ == "__main__":
                           env=os.environ | dict(PYTHONPATH=str(Path(diswm.__file__).parent)))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert {f"DisWM/{name}-v0" for name in PAPER_TASKS} <= gym.registry.keys()
+
+
+@pytest.mark.parametrize("gl, imports, ends, says", [
+    (None, "mujoco, dm_control.suite, gymnasium.envs.mujoco.mujoco_rendering", 0, "mean True"),
+    (" EGL", "diswm", 0, "mean True"), ("bogus", "diswm", 1, "export MUJOCO_GL=egl"),
+    ("disabled", "diswm", 3, "export MUJOCO_GL=egl"), ("glfw", "diswm", 3, "export MUJOCO_GL=egl")])
+def test_any_mujoco_gl_and_order_of_imports_works_or_is_one_line(gl, imports, ends, says):
+    """Without a display: unset or imported first it is EGL; else one line names the remedy. Some of
+    these were tracebacks, of which MuJoCo's half-made Renderer printed another one at its end."""
+    code = f"""
+import sys, {imports}, diswm
+try:
+    with diswm.make_env("walker_walk", phase="none") as env:
+        print("mean", env.reset(seed=0)[0].mean() > 50)
+except diswm.UserError as error:
+    print(error)
+    sys.exit(3)
+"""
+    env = {name: value for name, value in os.environ.items()
+           if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")}
+    env |= dict(PYTHONPATH=str(Path(diswm.__file__).parent)) | (dict(MUJOCO_GL=gl) if gl else {})
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True,
+                          text=True, env=env)
+    assert done.returncode == ends and "Traceback" not in done.stderr
+    assert says in done.stdout + done.stderr and done.stdout.count("\n") == (ends != 1)
+
+
+def test_a_forked_process_says_what_to_do_instead_of_hanging():
+    """gymnasium.make_vec(…, vectorization_mode="async") forks by default: OpenGL hung there."""
+    def child(answer):
+        try:
+            make_env("walker_walk")
+        except UserError as error:
+            answer.send(str(error))
+
+    context = multiprocessing.get_context("fork")
+    answer, end = context.Pipe(duplex=False)
+    with make_env("walker_walk"):
+        process = context.Process(target=child, args=(end,))
+        process.start()
+        end.close()
+        assert answer.poll(20) and 'context="spawn"' in answer.recv()
+        process.join(20)
+        assert process.exitcode == 0
 
 
 @pytest.mark.parametrize("cut", [2, 3, 4, 99])
@@ -2669,11 +2717,12 @@ def test_no_path_in_a_checkpoint_is_followed(teacher, finished, tmp_path):
 
 
 @pytest.mark.parametrize("rows, says", [
-    (np.zeros((12, 64, 64, 3), np.uint8), "bad.npy remove uint8"),
-    (np.zeros(12, [("image", np.float32, (64, 64, 3)), ("is_first", bool)]), "bad.npy remove f4"),
-    (np.zeros(12, [("image", np.uint8, (64, 64, 3))]), "bad.npy remove is_first"),
-    (np.array([{}, None], object), "bad.npy remove Python objects"),
-    (np.zeros(7, diswm.VIDEO_ROW), "7 frames of 8 python diswm.py collect --src cheetah_run")],
+    (np.zeros((12, 64, 64, 3), np.uint8), "bad.npy import_videos.py uint8"),
+    (np.zeros(12, [("image", np.float32, (64, 64, 3)), ("is_first", bool)]),
+     "bad.npy import_videos.py f4"),
+    (np.zeros(12, [("image", np.uint8, (64, 64, 3))]), "bad.npy import_videos.py is_first"),
+    (np.array([{}, None], object), "bad.npy import_videos.py Python objects"),
+    (np.zeros(7, diswm.VIDEO_ROW), "7 frames of 8 python diswm.py collect import_videos.py")],
     ids=["plain array", "float images", "no is_first", "objects", "less than a window"])
 def test_foreign_video_is_one_line(rows, says, tmp_path):
     """It names the file and what is wrong with it; nothing is unpickled."""
@@ -2888,10 +2937,82 @@ def test_imported_videos_are_learnt_from(tmp_path):
     succeed("pretrain", "--videos", tmp_path / "episodes", "--runs", tmp_path, *DEBUG)
 
 
+def some_video(kind):
+    """Twelve frames, 96 × 128, that get brighter, as people have them."""
+    video = np.repeat(np.arange(0, 240, 20, np.uint8), 96 * 128 * 3).reshape(12, 96, 128, 3)
+    return dict(plain=video, first=np.moveaxis(video, -1, 1), grey=video[..., 0],
+                floats=(video / 255).astype(np.float32), single=video[..., :1],
+                rgba=np.concatenate([video, 255 - video[..., :1]], -1))[kind]
+
+
+@pytest.mark.parametrize("kind", ["plain", "first", "grey", "floats", "single", "rgba", "film.mp4",
+                                  "film.gif", "pictures", "chunks"])
+def test_videos_are_imported_as_people_have_them(kind, tmp_path, capsys, monkeypatch):
+    """Films, folders of pictures, any arrays become the same frames; one line says how."""
+    source = tmp_path / "source"
+    source.mkdir()
+    if kind.startswith("film"):
+        iio.imwrite(source / kind, some_video("plain"), **dict(fps=25) if "mp4" in kind else {})
+    elif kind == "pictures":
+        (source / kind).mkdir()
+        for i, picture in enumerate(some_video("rgba")):
+            iio.imwrite(source / kind / f"frame_{i}.png", picture)  # 10 comes after 9
+    else:
+        np.save(source / "video.npy", some_video("plain" if kind == "chunks" else kind))
+    if kind == "chunks":
+        monkeypatch.setattr(script("import_videos"), "CHUNK", 5)
+    script("import_videos").main([str(source), str(tmp_path / "episodes")])
+    episodes = Replay(tmp_path / "episodes")
+    assert episodes.bounds[1:] == ([5, 10, 12] if kind == "chunks" else [12])
+    window = episodes.window(0, 12)
+    error = np.abs(window["image"].astype(int) - np.arange(0, 240, 20)[:, None, None, None])
+    assert error.max() <= (4 if "mp4" in kind else 0)
+    assert np.flatnonzero(window["is_first"]).tolist() == [0]
+    says, total = capsys.readouterr().out.splitlines()
+    assert "12 frames of " in says and "by area" in says and total.endswith("1 videos")
+
+
+@pytest.mark.parametrize("crop", [False, True])
+def test_frames_are_resized_by_area_and_squeezed_or_cropped(crop):
+    """Each pixel is the mean of those that it covers; --crop takes the middle square."""
+    picture = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
+    seen = picture[:, 64:192] if crop else picture
+    area = seen.reshape(64, 2, 64, -1, 3).mean((1, 3))
+    assert np.abs(script("import_videos").to_frame(picture, crop) - area).max() <= 1  # rounded twice
+
+
+def test_a_chunk_of_several_episodes_keeps_where_they_begin(tmp_path):
+    """A replay's chunk has is_first inside, which the import and pretraining keep."""
+    first = np.arange(30) % 10 == 4
+    np.savez(tmp_path / "chunk.npz", image=np.zeros((30, 64, 64, 3), np.uint8), is_first=first)
+    script("import_videos").main([str(tmp_path), str(tmp_path / "episodes")])
+    replay = Replay(tmp_path / "episodes")
+    assert np.flatnonzero(replay.window(0, 30)["is_first"]).tolist() == [0, 4, 14, 24]
+    batch = replay.sample(50, 8, np.random.default_rng(0))
+    assert batch["is_first"][:, 0].all() and batch["is_first"][:, 1:].any()
+
+
+def test_a_long_video_is_never_in_memory_as_a_whole(tmp_path):
+    """50 000 frames are 614 MB; a part of the last video stays with the run, for `traverse`."""
+    np.lib.format.open_memmap(tmp_path / "long.npy", "w+", diswm.VIDEO_ROW, (50_000,)).flush()
+    code = f"""
+import resource, diswm
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert diswm.main(["pretrain", "--videos", "{tmp_path}", "--runs", "{tmp_path}/runs", "--preset",
+                   "debug", "--device", "cpu"]) == 0
+print("more:", (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+    env = os.environ | dict(PYTHONPATH=str(Path(diswm.__file__).parent))
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True,
+                          text=True, env=env)
+    assert int(done.stdout.split()[-1]) < 300, done.stdout + done.stderr
+
+
 def test_what_is_no_video_is_refused(tmp_path):
     """One line names the file and what is wrong with it, also where the end is cut off."""
     path, argv = tmp_path / "bad.npz", [str(tmp_path), str(tmp_path / "episodes")]
-    for array, says in ((np.zeros((9, 64, 64, 3)), "float64"), (np.array([{}], object), "pickle"),
+    for array, says in ((np.full((9, 64, 64, 3), 2.0), "[2, 2]"),
+                        (np.array([{}], object), "pickle"),
                         (np.zeros((64, 64, 3), np.uint8), "(64, 64, 3)"),
                         (np.zeros((0, 64, 64, 3), np.uint8), "(0, 64"), (None, "not a zip")):
         np.savez(path, image=array)
