@@ -427,7 +427,7 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **s
         raise
     except Exception as error:  # simulators and OpenGL have many of their own
         raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; export "
-                        "MUJOCO_GL=egl, or give a MuJoCo task with continuous actions") from error
+                        "MUJOCO_GL=egl, run: bash run_all.sh, or choose another task") from error
     env.reset(seed=seed)
     return env
 

@@ -2978,7 +2978,8 @@ def test_frames_are_resized_by_area_and_squeezed_or_cropped(crop):
     picture = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
     seen = picture[:, 64:192] if crop else picture
     area = seen.reshape(64, 2, 64, -1, 3).mean((1, 3))
-    assert np.abs(script("import_videos").to_frame(picture, crop) - area).max() <= 1  # rounded twice
+    frame = script("import_videos").to_frame(picture, crop)
+    assert np.abs(frame - area).max() <= 1  # it is rounded twice
 
 
 def test_a_chunk_of_several_episodes_keeps_where_they_begin(tmp_path):
