@@ -426,8 +426,9 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **s
     except UserError:
         raise
     except Exception as error:  # simulators and OpenGL have many of their own
-        raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; export "
-                        "MUJOCO_GL=egl, run: bash run_all.sh, or choose another task") from error
+        raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; give a MuJoCo "
+                        "task with continuous actions, or export MUJOCO_GL=egl and run: "
+                        "bash run_all.sh") from error
     env.reset(seed=seed)
     return env
 
