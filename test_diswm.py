@@ -2994,18 +2994,26 @@ def test_a_chunk_of_several_episodes_keeps_where_they_begin(tmp_path):
 
 
 def test_a_long_video_is_never_in_memory_as_a_whole(tmp_path):
-    """50 000 frames are 614 MB; a part of the last video stays with the run, for `traverse`."""
+    """50 000 frames are 614 MB; a part of the last video stays with the run, for `traverse`. An
+    import has a chunk of 1000 frames in memory."""
+    folder = Path(diswm.__file__).parent
     np.lib.format.open_memmap(tmp_path / "long.npy", "w+", diswm.VIDEO_ROW, (50_000,)).flush()
+    (tmp_path / "raw").mkdir()
+    large = np.lib.format.open_memmap(tmp_path / "raw" / "large.npy", "w+", np.uint8,
+                                      (1500, 480, 320, 3))
+    large.flush()
     code = f"""
-import resource, diswm
+import resource, sys, diswm
+sys.path.append("{folder}/results")
+import import_videos
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 assert diswm.main(["pretrain", "--videos", "{tmp_path}", "--runs", "{tmp_path}/runs", "--preset",
                    "debug", "--device", "cpu"]) == 0
+import_videos.main(["{tmp_path}/raw", "{tmp_path}/episodes"])
 print("more:", (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
 """
-    env = os.environ | dict(PYTHONPATH=str(Path(diswm.__file__).parent))
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True,
-                          text=True, env=env)
+                          text=True, env=os.environ | dict(PYTHONPATH=str(folder)))
     assert int(done.stdout.split()[-1]) < 300, done.stdout + done.stderr
 
 

@@ -71,7 +71,12 @@ def read_array(path):
         raise ValueError(f"its array is {saved.dtype} {saved.shape}")
     if saved.dtype.kind not in "fuib" or is_first is not None and len(is_first) != len(saved):
         raise ValueError(f"its array is {saved.dtype} {saved.shape} with is_first {is_first}")
-    return saved, is_first
+    if path.suffix == ".npz":
+        return saved, is_first
+    # Mapped anew for each frame: what has been read does not stay in memory.
+    field = "image" if is_first is not None else ...
+    count = range(len(saved))
+    return (np.load(path, mmap_mode="r")[field][index] for index in count), is_first
 
 def read_video(path):
     """→ (its pictures one by one, is_first (T,) or None)."""
