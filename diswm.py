@@ -1091,7 +1091,7 @@ def run_folder(cfg, stage):
 
 def read_checkpoint(path):
     """A checkpoint, loaded without executing code. No path in it is followed."""
-    with reading(path, "checkpoint of ours", "make one: python diswm.py finetune --fresh"):
+    with reading(path, "checkpoint of ours", "run: python diswm.py finetune or pretrain --fresh"):
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return dict(saved, config=Config(**saved["config"]), log=str(saved["log"]))
 
