@@ -12,7 +12,6 @@ at first, then less. DreamerV2's actor-critic learns in imagination.
                world model ──► imagination ──► actor, critic (appendix B)
     evaluate, traverse    returns; latent traversals, open-loop predictions
 
-The sections follow a batch from the simulator to the loss; the method begins at "Maths".
     o     image            𝐳 (z, embed)  β-VAE latent, 20 of them    h (deter)  recurrent state
     a, r  action, reward   z_t (stoch)   stochastic state            s (feat)   [z_t, h_t]
     γ     discount         q (post), p (prior)  of z_t               V          λ-return
@@ -26,6 +25,8 @@ import contextlib
 import ctypes
 import difflib
 import fcntl
+import hashlib
+import importlib
 import inspect
 import io
 import json
@@ -35,11 +36,12 @@ import os
 import re
 import shutil
 import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo's own choice needs a display
+os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"
 
 import gymnasium as gym
 import imageio.v3 as iio
@@ -49,12 +51,8 @@ import torch.nn.functional as F
 from torch import nn
 from tqdm import tqdm
 
-try:
-    import mujoco
-    from dm_control import suite
-except (AttributeError, ImportError) as error:  # how a missing libEGL or libOSMesa shows
-    sys.exit(f"error: MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; run: bash run_all.sh test")
-
+GL = f"MUJOCO_GL={os.environ['MUJOCO_GL']}"
+GL_REMEDY = "export MUJOCO_GL=egl; bash run_all.sh test"
 log = logging.getLogger("diswm")  # only the command line prints
 
 class UserError(Exception):
@@ -63,12 +61,36 @@ class UserError(Exception):
 class UsageError(UserError):
     """A wrong flag, value or task: the exit code is 2."""
 
+class OpenGLError(SystemExit, UserError):
+    """Of the import: one line and no traceback, even uncaught."""
+
+@contextlib.contextmanager
+def reading(path, kind, remedy="start over with --fresh"):
+    """What foreign files and libraries raise becomes one line."""
+    try:
+        yield
+    except Exception as error:
+        if type(error) in (UserError, MemoryError):  # not a Config's
+            raise
+        cause = f"{type(error).__name__}: {error}".split("\n")[0][:120]
+        raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from error
+
+try:
+    import mujoco
+    importlib.reload(mujoco.gl_context)  # an earlier import did not see MUJOCO_GL
+    from dm_control import suite
+except (AttributeError, ImportError, RuntimeError) as error:  # of missing libraries
+    raise OpenGLError(f"error: {GL}: {error}; {GL_REMEDY}") from error
+PROCESS = os.getpid()
+mujoco.Renderer._gl_context = mujoco.Renderer._mjr_context = None  # one that fails can close
+
 # === Config ===
 @dataclass(frozen=True)
 class Config:
     """The comments are the flags' help. Values are of the paper's (table) or, by default, of the
     published configuration. A *decision* is an action, held for `action_repeat` env steps."""
     # --- run: what, where it is kept, how long
+    preset: str = "paper"  # sizes; without CUDA: small (ours)
     src: str = "cheetah_run"  # task of the distracting videos (paper)
     dst: str = "walker_walk"  # target task (paper)
     method: str = "diswm"  # the paper's method, a baseline or an ablation (paper)
@@ -86,6 +108,7 @@ class Config:
     colors: str = "published"  # boxes around fixed centres or the original colours (paper)
     color_range: float = 0.2  # half width of a box, RGB in 0..1
     fast_render: bool = False  # no anti-aliasing, about twice as fast (ours)
+    camera: str = ""  # one of the task's, by name; empty: one that shows it (ours)
     # --- acting, and how often to learn
     prefill: int = 2500  # decisions at random before learning
     first_updates: int = 100  # updates right after prefill
@@ -138,8 +161,6 @@ class Config:
     def __post_init__(self):
         """Raises UsageError at values that cannot be meant."""
         for name, value in vars(self).items():
-            if name in CHOICES and value not in CHOICES[name]:
-                raise UsageError(f"{flag_name(name)} {value}: not of {', '.join(CHOICES[name])}")
             low = LOWEST.get(name, 1 if type(value) is int else 0)
             if type(value) in (int, float) and not low <= value < 2**62:  # nor NaN
                 raise UsageError(f"{flag_name(name)} {value}: not {low} or more")
@@ -149,8 +170,8 @@ LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
                carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
                device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
-MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads")  # of a run
-LOG_EVERY = 100  # updates of pretraining
+MAY_CHANGE = ("preset", "runs", "teacher", "videos", "device", "precision", "threads",  # of a run
+              "switch", "steps", "collect_steps", "pretrain_updates", "eval_episodes")
 
 def flag_name(name):
     """lambda_ → --lambda"""
@@ -158,17 +179,16 @@ def flag_name(name):
 
 PRESETS = {
     "paper": Config(),
-    # For two CPU cores. A batch five times smaller wants a larger model_lr. η's clock shrinks
-    # with the run, and η grows by 50 / 32, as Eq. (3) sums over time.
+    # Smaller batches want a larger model_lr. η grows by 50 / 32: Eq. (3) sums over time.
     "small": Config(
-        steps=100_000, collect_steps=20_000, pretrain_updates=1_000,
+        preset="small", steps=100_000, collect_steps=20_000, pretrain_updates=1_000,
         fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
         cnn_depth=16, model_lr=1e-3, eta=0.156, eta_end=0.0156, eta_decay=5_000),
-    "debug": Config(  # seconds, for tests: everything happens, nothing is learnt
-        steps=300, collect_steps=200, pretrain_updates=20, prefill=50, first_updates=2,
-        threads=1, train_every=10, eval_every=100, eval_episodes=2, time_limit=50, batch_size=3,
-        batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12, hidden=10, units=10, eta=0.6,
-        eta_end=0.06, eta_decay=60, slow_every=5),
+    "debug": Config(  # seconds, for tests: nothing is learnt
+        preset="debug", steps=300, collect_steps=200, pretrain_updates=20, prefill=50,
+        first_updates=2, threads=1, train_every=10, eval_every=100, eval_episodes=2,
+        time_limit=50, batch_size=3, batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12,
+        hidden=10, units=10, eta=0.6, eta_end=0.06, eta_decay=60, slow_every=5),
 }
 NO_DISTILL, NO_BETA = dict(eta=0.0, eta_end=0.0), dict(beta=0.0, beta2=0.0)
 # DEVIATION: Gaussian latents in all methods; those of DreamerV2 and APV were discrete.
@@ -177,13 +197,15 @@ METHODS = dict(  # sets of Config values; all run through the same code
     diswm={}, no_distill=NO_DISTILL, no_disentangle=NO_BETA, dreamerv2=DV2,
     dv2_finetune=DV2 | dict(carry_over="weights"),
     apv=DV2 | dict(carry_over="stack", bonus=0.1))
+CHOICES |= dict(preset=PRESETS, method=METHODS)
 
 # === Tasks and distractors (sections 2 and 4) ===
 vars(np).setdefault("in1d", np.isin)  # dropped by NumPy 2.4, called by dm_control
-TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS}
+TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS
+         if domain != "lqr"}  # whose actions have no bounds
 OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
-PHASES = ("train", "shifted", "eval", "none")
-# DEVIATION: around these, as published; the paper says around the original ones.
+PHASES = ("train", "shifted", "eval", "none")  # none: the task's own colours
+# DEVIATION: as published; the paper says around the original ones.
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3), eval=(0.5, 0.7, 0.3))
 
 def family(task):
@@ -197,16 +219,20 @@ def check_task(task):
         return
     with contextlib.redirect_stderr(io.StringIO()):  # it prints a notice
         import gymnasium_robotics  # noqa: F401  registers its tasks
-    if task not in gym.registry:
-        near = difflib.get_close_matches(task, [*known, *gym.registry]) or ["none"]
-        raise UsageError(f"unknown task '{task}'; near: {' '.join(near)}; all: {' '.join(known)} "
-                         "and MuJoCo tasks of gymnasium, gymnasium-robotics")
+    known += [name for name in gym.registry if not name.startswith("DisWM/")]
+    if task not in known:
+        near = difflib.get_close_matches(task, known) or ["none"]
+        raise UsageError(f"unknown task '{task}'; near: {' '.join(near)}; all: {' '.join(TASKS)}")
 
 class DMControlEnv(gym.Env):
-    """A task of dm_control.suite as a gymnasium.Env, with nothing observed."""
+    """A task of dm_control.suite, with nothing observed."""
     def __init__(self, domain, task):
-        self.env = suite.load(domain, task, dict(random=0))
+        self.env = suite.load(domain, task, dict(random=0, time_limit=math.inf))
+        self.env.physics._make_rendering_contexts = lambda: None  # they spoil ours
         self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr
+        self.metadata = dict(render_fps=1 / self.env.control_timestep())
+        if domain in ("acrobot", "ball_in_cup", "fish", "pendulum", "swimmer"):
+            self.model.cam_fovy *= 0.82  # closer, else < 1 % of the picture moves
         spec = self.env.action_spec()
         self.action_space = gym.spaces.Box(np.float32(spec.minimum), np.float32(spec.maximum))
 
@@ -223,7 +249,7 @@ class DMControlEnv(gym.Env):
         return None, float(step.reward), terminated, step.last() and not terminated, {}
 
 def drawer_world(task):
-    """DrawerWorld: Meta-World's task, whose table top reset(options={"phase": …}) chooses."""
+    """Meta-World's task, whose table top reset(options={"phase": …}) chooses."""
     import metaworld.env_dict  # takes a second
     textures = metaworld.__path__[0] + "/assets/textures/"
     grid = dict(builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mark=mujoco.mjtMark.mjMARK_EDGE,
@@ -247,50 +273,60 @@ def drawer_world(task):
             name = options["phase"].replace("none", "table_wood")
             self.model.geom_matid[top] = self.model.mat(name).id
             result = super().reset()
-            mujoco.mj_forward(self.model, self.data)  # else the drawer is drawn where it was
+            mujoco.mj_forward(self.model, self.data)  # else it is drawn where it was
             return result
 
     env = DrawerWorld()
-    # Draw a goal at each reset, from the seed; its own benchmark sets one of a list.
+    # Draw a goal at each reset; its own benchmark sets one of a list.
     env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
-    # DEVIATION: published from 0.96 above, where half of this drawer is out of sight.
-    env.mujoco_renderer.default_cam_config = dict(
-        distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0))
+    env.max_path_length = math.inf  # make_env limits the time
     return env
 
 def bare_simulator(task):
-    """A task's simulator without wrappers → (env, simulator steps per episode)."""
+    """A task's bare simulator → (env, simulator steps per episode)."""
     if task in TASKS:
         return DMControlEnv(*TASKS[task]), 1000
     if family(task) == "drawer":
         return drawer_world(task), 200
-    if task == "pusher":  # as published
-        above = dict(distance=2.0, azimuth=90, elevation=-90, lookat=(0, -0.5, 0.2))
-        return gym.make("Pusher-v5", default_camera_config=above).unwrapped, 100
-    env = gym.make(task, disable_env_checker=True).unwrapped
-    return env, gym.spec(task).max_episode_steps or 1000
+    name = task.replace("pusher", "Pusher-v5")
+    env = gym.make(name, disable_env_checker=True).unwrapped
+    return env, gym.spec(name).max_episode_steps or 1000
 
-def find_camera(env):
-    """dm_control's first one; gymnasium's own choice: "track", else a free one."""
-    if isinstance(env, DMControlEnv):
-        return 0
-    camera = mujoco.mj_name2id(env.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
-    if camera < 0:
-        camera = mujoco.MjvCamera()
-        mujoco.mjv_defaultFreeCamera(env.model, camera)
-        for name, value in (env.mujoco_renderer.default_cam_config or {}).items():
-            setattr(camera, name, value)
+CAMERAS = dict(  # a task's beginning → a camera's name or a free one's values
+    quadruped="y", dog_fetch="y-axis", cartpole_three_poles="lookatcart",
+    PointMaze=dict(elevation=-90),  # else its walls hide it
+    Reacher=dict(distance=0.65, elevation=-90, lookat=(0, 0, 0)),
+    InvertedDoublePendulum=dict(distance=4, elevation=-10, lookat=(0, 0, 0.6)),
+    pusher=dict(distance=2, elevation=-90, lookat=(0, -0.5, 0.2)),  # as published
+    # DEVIATION: published from 0.96 above, which cuts this drawer off.
+    drawer=dict(distance=1.2, azimuth=180, elevation=-90, lookat=(0, 0.62, 0)))
+
+def find_camera(env, task, name):
+    """The named one, that of CAMERAS, dm_control's first or gymnasium's choice."""
+    names = [env.model.camera(i).name for i in range(env.model.ncam)]
+    if name and name not in names:
+        raise UserError(f"no camera '{name}'; {task} has: {', '.join(names) or 'none'}")
+    views = [CAMERAS[start] for start in CAMERAS if task.startswith(start)]
+    views += [other for other in names if task in TASKS or other == "track"]
+    view = name or (views or [{}])[0]
+    if view in names:
+        return view
+    camera, own = mujoco.MjvCamera(), vars(getattr(env, "mujoco_renderer", env))
+    mujoco.mj_kinematics(env.model, env.data)
+    values = dict(lookat=np.median(env.data.geom_xpos, 0), distance=env.model.stat.extent)
+    for field, value in (values | (own.get("default_cam_config") or {}) | view).items():
+        setattr(camera, field, value)
     return camera
 
 def color_box(phase, original, colors="published", half_range=0.2):
-    """What a phase draws colours from: (low, high), both like `original` (n, 3), 0..1."""
+    """A phase's colours: (low, high), both like `original` (n, 3), 0..1."""
     center = original if phase == "train" else np.roll(original, 1, -1)  # (ours)
     if colors == "published":
         center = np.broadcast_to(COLOR_CENTERS[phase], original.shape)
     return np.clip(center - half_range, 0, 1), np.clip(center + half_range, 0, 1)
 
 def color_groups(task, model):
-    """What the distractor colours: (RGBA array, rows that share a colour) of each group."""
+    """Of each group: an RGBA array and its rows that share a colour."""
     if family(task) == "drawer":
         return []  # textures instead
     if task in TASKS:
@@ -299,55 +335,59 @@ def color_groups(task, model):
         arm = [model.geom(name).id for name in ("uar", "ua", "ef", "sp", "fa", "sl", "e1", "e2")]
         groups = [model.body("object").geomadr[0]], [model.geom("table").id], arm
         return [(model.geom_rgba, rows) for rows in groups]
-    # A geom wears its material where it has one and its own colour is the default.
-    own = (model.geom_matid < 0) | (model.geom_rgba != (0.5, 0.5, 0.5, 1)).any(1)
+    own = (model.geom_matid < 0) | (model.geom_rgba != (0.5, 0.5, 0.5, 1)).any(1)  # no material
     materials = [(model.mat_rgba, [i]) for i in np.unique(model.geom_matid[~own])]
     return materials + [(model.geom_rgba, [i]) for i in np.flatnonzero(own)]
 
 class DistractingEnv(gym.Wrapper):
-    """A simulator in colours drawn for each episode; reset(options={"phase": …}) changes their
-    phase. By mujoco.Renderer: simulators that render() show each other's textures."""
-    metadata, render_mode = {"render_modes": ["rgb_array"]}, "rgb_array"
+    """A simulator in colours drawn for each episode, by the phase in reset's options."""
+    render_mode = "rgb_array"
+    spec = property(lambda self: self.unwrapped.spec)  # of make_env
 
     def __init__(self, env, task, phase, *, action_repeat=2, colors="published",
-                 color_range=0.2, fast_render=False, size=64):
+                 color_range=0.2, fast_render=False, camera="", size=64):
         super().__init__(env)
         model, self.data = self.unwrapped.model, self.unwrapped.data
         self.phase, self.action_repeat = phase, action_repeat
-        self.rng = np.random.default_rng()
+        fps = env.metadata.get("render_fps", 25) / action_repeat  # decisions a second
+        self.metadata = dict(render_modes=["rgb_array"], render_fps=fps)
         self.groups = color_groups(task, model)
         self.original = [array[rows, :3] for array, rows in self.groups]  # copies
         original = np.array([rgb[0] for rgb in self.original]).reshape(-1, 3)
         self.boxes = {p: color_box(p, original, colors, color_range) for p in COLOR_CENTERS}
         if task == "pusher":  # its object is black
             self.boxes = {p: np.array(box) * [[0], [1], [1]] for p, box in self.boxes.items()}
-        self.camera = find_camera(self.unwrapped)
+        self.camera = find_camera(self.unwrapped, task, camera)
         self.observation_space = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
-        # DEVIATION: small shadow maps (20–60 % of a frame's time), no mirrors (12 %): < 0.6 / 255.
+        # DEVIATION: small shadow maps, no mirrors: fast, < 0.6 / 255.
         model.vis.quality.shadowsize = 512
         if fast_render:
             model.vis.quality.offsamples = 0  # half of the rest, for 1–2 / 255
-        self.renderer = mujoco.Renderer(model, size, size)
+        self.renderer = mujoco.Renderer(model, size, size)  # env.render() mixes textures
         self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self.renderer._scene_option.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER] = 0  # rays
         atexit.register(self.renderer.close)  # else errors at exit
 
     def reset(self, *, seed=None, options=None):
         if seed is not None:
             self.rng = np.random.default_rng([seed, 1])  # not the simulator's
-        self.phase = (options or {}).get("phase", self.phase)
-        colors = self.original
-        if self.phase != "none":
-            colors = self.rng.uniform(*self.boxes[self.phase])
+        phase = (options or {}).get("phase", self.phase)
+        if phase not in PHASES:
+            raise UsageError(f"unknown phase '{phase}'; there are: {', '.join(PHASES)}")
+        self.phase, colors = phase, self.original
+        if phase != "none":
+            colors = self.rng.uniform(*self.boxes[phase])
         for (array, rows), color in zip(self.groups, colors, strict=True):
             array[rows, :3] = color
-        _, info = self.env.reset(seed=seed, options=dict(phase=self.phase))
+        mujoco.mj_resetData(self.unwrapped.model, self.data)  # a hand's leaves some
+        _, info = self.env.reset(seed=seed, options=dict(phase=phase))
         for index in range(self.unwrapped.model.nhfield):
             self.renderer._gl_context.make_current()  # quadruped's terrain is new
             mujoco.mjr_uploadHField(self.unwrapped.model, self.renderer._mjr_context, index)
         return self.render(), info
 
     def step(self, action):
-        # DEVIATION: the published code repeats twice (4 steps) and doubles rewards.
+        # DEVIATION: published, 4 steps and doubled rewards.
         total, steps, over, reached = 0.0, 0, False, []
         while steps < self.action_repeat and not over:
             _, reward, terminated, truncated, info = self.env.step(action)
@@ -370,38 +410,32 @@ class DistractingEnv(gym.Wrapper):
         self.renderer.close()
         super().close()
 
-def make_env(task, *, phase="train", seed=0, time_limit=0, **settings):
-    """A gymnasium.Env with actions in [−1, 1] and uint8 images. time_limit: simulator steps, 0:
-    the task's own. phase: "train", "shifted" (after the midpoint), "eval" (drawers: metal;
-    others: as shifted), "none" (the task's own look)."""
+def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **settings):
+    """Actions in [−1, 1], uint8 images. time_limit: simulator steps; 0: the task's own."""
     check_task(task)
-    if phase not in PHASES:
-        raise UsageError(f"unknown phase '{phase}'; there are: {', '.join(PHASES)}")
-    try:
+    if os.getpid() != PROCESS:
+        raise UserError('OpenGL hangs in a forked process; use context="spawn"')
+    with reading(task, f"MuJoCo task with continuous actions, or {GL} fails", GL_REMEDY):
         env, limit = bare_simulator(task)
         env = gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         env = gym.wrappers.TimeLimit(env, time_limit or limit)
         env = DistractingEnv(env, task, phase, **settings)
-    except Exception as error:  # simulators and OpenGL have many of their own
-        raise UserError(f"{task} with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; give a MuJoCo "
-                        "task with continuous actions, or run: bash run_all.sh") from error
     env.reset(seed=seed)
     return env
 
 for name in (*TASKS, *OTHER_TASKS):
-    gym.register(f"DisWM/{name}-v0", make_env, kwargs=dict(task=name))
+    gym.register(f"DisWM/{name}-v0", f"{__name__}:make_env", kwargs=dict(task=name))
 
 def config_env(cfg, task):
-    """make_env with the values of a Config."""
-    names = ("action_repeat", "time_limit", "colors", "color_range", "fast_render")
+    names = ("action_repeat", "time_limit", "colors", "color_range", "fast_render", "camera")
     return make_env(task, **{name: getattr(cfg, name) for name in names})
 
 # === Episodes and the replay buffer ===
-# A video predictor sees rows of these fields and no others.
 VIDEO_ROW = np.dtype([("image", np.uint8, (64, 64, 3)), ("is_first", np.bool_)])
+IMPORT = "run: python results/import_videos.py FROM TO"
 
 def agent_row(action_dim):
-    """A row of an agent's episode as a NumPy dtype:
+    """A row of an agent's episode as a NumPy dtype; videos have image and is_first alone.
            row t       0     1      …
            image      o_0   o_1
           action       0    the a that led to o_1     (the paper's a_{t−1})
@@ -412,7 +446,7 @@ def agent_row(action_dim):
                      ("reward", np.float32), ("discount", np.float32)])
 
 class Episode:
-    """An episode that is being played; its rows are those of `agent_row`."""
+    """An episode that is being played, in rows of `agent_row`."""
     def __init__(self, env, seed, phase):
         image, _ = env.reset(seed=seed, options=dict(phase=phase))
         self.env, self.over, self.success, self.total = env, False, None, 0.0
@@ -421,7 +455,6 @@ class Episode:
         self.rows = [dict(image=image, action=action, reward=0.0, discount=1.0, is_first=True)]
 
     def random_action(self):
-        """Uniform in [−1, 1]."""
         return self.rng.uniform(-1, 1, self.env.action_space.shape).astype(np.float32)
 
     def step(self, action):
@@ -438,17 +471,6 @@ def write_whole(path, content):
     temporary = path.with_name(path.name + ".tmp")
     temporary.write_bytes(content)
     os.replace(temporary, path)
-
-@contextlib.contextmanager
-def reading(path, kind, remedy="start over with --fresh"):
-    """What damaged or foreign content raises becomes one line."""
-    try:
-        yield
-    except (UserError, MemoryError):
-        raise
-    except Exception as error:  # numpy, torch, pickle and zipfile have their own
-        cause = f"{type(error).__name__}: {error}".split("\n")[0][:120]
-        raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from error
 
 class Replay:
     """Finished episodes, a file each, laid end to end; windows start uniformly anywhere.
@@ -468,7 +490,7 @@ class Replay:
 
     def read(self, path):
         """An episode's rows, mapped into memory. UserError at wrong fields."""
-        with reading(path, f"episode with {', '.join(self.dtype.names)}", "remove it"):
+        with reading(path, f"episode with {', '.join(self.dtype.names)}", IMPORT):
             rows = np.load(path, mmap_mode="r", allow_pickle=False)
             good = all(rows.dtype[name] == self.dtype[name] for name in self.dtype.names)
             if not good or rows.ndim != 1 or len(rows) == 0:
@@ -485,15 +507,10 @@ class Replay:
         write_whole(path, file.getbuffer())
         self.append(path)
 
-    def state_dict(self):
-        """What a checkpoint needs: the number of episodes."""
-        return dict(episodes=len(self.paths))
-
-    def load_state_dict(self, state):
-        """Return to those episodes; later ones, of a run cut off, go."""
-        count = state["episodes"]
+    def keep(self, count):
+        """Return to the first episodes; later ones, of a run cut off, go."""
         if [path.stem for path in self.paths[:count]] != [f"{i:06d}" for i in range(count)]:
-            raise UserError(f"{self.folder} lacks episodes or has others; start over: --fresh")
+            raise UserError(f"{self.folder} lacks episodes; start over with --fresh")
         for path in self.paths[count:]:
             path.unlink(missing_ok=True)
         self.paths, self.bounds = self.paths[:count], self.bounds[:count + 1]
@@ -1074,32 +1091,50 @@ def run_folder(cfg, stage):
 
 def read_checkpoint(path):
     """A checkpoint, loaded without executing code. No path in it is followed."""
-    if not Path(path).exists():
-        raise UserError(f"no checkpoint {path}; run: python diswm.py finetune --dst walker_walk")
-    with reading(path, "checkpoint of ours"):
+    with reading(path, "checkpoint of ours", "run: python diswm.py finetune or pretrain --fresh"):
         saved = dict(torch.load(path, map_location="cpu", weights_only=True))
         return dict(saved, config=Config(**saved["config"]), log=str(saved["log"]))
 
 class Run:
-    """A run's folder, which `start` makes. Colours, η and all seeds follow from the counts in
-    `done`, so that no checkpoint needs a simulator or a random state."""
+    """A run's folder. Colours, η and seeds follow from the counts in `done`, no random state."""
     def __init__(self, cfg, stage, fresh=False):
-        self.cfg, self.stage, self.fresh, self.log = cfg, stage, fresh, ""
+        check_task(cfg.src)
+        check_task(cfg.dst)
+        self.cfg, self.stage, self.fresh, self.log, self.inputs = cfg, stage, fresh, "", {}
         self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0)
         self.folder = run_folder(cfg, stage)
         self.resumes = (self.folder / "checkpoint.pt").exists() and not fresh
         if self.resumes:
             self.saved = read_checkpoint(self.folder / "checkpoint.pt")
-            self.log, old, new = self.saved["log"], vars(self.saved["config"]), vars(cfg)
+            self.log, self.inputs = self.saved["log"], self.saved.get("inputs", {})
             vars(self.done).update(self.saved["done"])
+            old, new = vars(self.saved["config"]), vars(cfg)
             differ = [f"{flag_name(name)} {old[name]} (now {new[name]})" for name in new
-                      if old[name] != new[name] and name not in MAY_CHANGE]
+                      if new[name] != old[name] and name not in MAY_CHANGE]
+            if differ and old["preset"] != new["preset"]:  # explains the others
+                differ = [f"--preset {old['preset']} (now {new['preset']})"]
             if differ:
-                raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the "
-                                "same flags, or --fresh to start over, or another --runs")
+                raise UserError(f"{self.folder} was started with other flags: add "
+                                f"{', '.join(differ)}, or --fresh")
+            switch, moved = (color_phase(c, -1)[1] for c in (self.saved["config"], cfg))
+            if switch != moved and min(switch, moved) < self.done.env_steps:
+                raise UserError(f"{self.folder} changes colours at step {switch}: "
+                                f"add --switch {switch / cfg.steps}")
+
+    def check_input(self, name, path, files):
+        """Note files that decide the result, by content: it takes no others."""
+        digest = hashlib.sha256()
+        for file in files:
+            with open(file, "rb") as content:
+                digest.update(hashlib.file_digest(content, "sha256").digest())
+        now = f"{flag_name(name)} {path} of sha256 {digest.hexdigest()[:12]}"
+        log.info("%s", now)
+        before = self.inputs.setdefault(name, now)
+        if before[-12:] != now[-12:]:
+            raise UserError(f"{self.folder} was started with {before}, not {now}; or --fresh")
 
     def start(self, unit, total, **parts):
-        """Make and lock the folder. parts (with a state_dict) go on from its checkpoint."""
+        """Make and lock the folder; parts go on from its checkpoint."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import
         self.unit, self.total, self.parts = unit, total, parts
         begin = getattr(self.done, unit)
@@ -1113,16 +1148,15 @@ class Run:
             with reading(self.folder / "checkpoint.pt", "checkpoint of ours"):
                 for name, part in parts.items():
                     part.load_state_dict(self.saved[name])
-        else:  # what --fresh replaces goes late: a mistake in the command costs nothing
+        else:  # what --fresh replaces goes late: mistakes cost nothing
             for path in set(self.folder.iterdir()) - {self.folder / "lock"}:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-            if "replay" in parts:
-                parts["replay"].load_state_dict(dict(episodes=0))
             self.save()
-        log.info("%s, at %s of %s %s, on %s with %s", self.folder, f"{begin:,}", f"{total:,}",
-                 unit, self.cfg.device, self.cfg.precision)
+        log.info(f"{self.folder}, at {begin:,} of {total:,} {unit}, on {self.cfg.device}")
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
+        self.bar._time = time.monotonic  # clocks may be set back
+        self.bar.start_t = self.bar.last_print_t = time.monotonic()
         self.writer = SummaryWriter(self.folder, purge_step=begin + 1, flush_secs=5)
 
     def record(self, **row):
@@ -1135,27 +1169,26 @@ class Run:
                 self.writer.add_scalar(name, value, done)
         self.save()
         shown = ("train_return", "eval_return", "image", "reward", "kl", "disentangle", "eta")
-        shown = "  ".join(f"{name} {row[name]:.4g}" for name in shown if name in row)
-        self.bar.set_postfix_str(shown, refresh=False)
+        self.bar.set_postfix({name: row[name] for name in shown if name in row}, refresh=False)
         self.bar.update(done - self.bar.n)
         if not sys.stderr.isatty():
             log.info("%s", self.bar)
 
     def save(self):
-        """Write config and log, for people, and the checkpoint, which holds them too."""
+        """Write config and log, for people, and the checkpoint."""
         config, file = vars(self.cfg), io.BytesIO()  # a full disk is the file's error
         state = {name: part.state_dict() for name, part in self.parts.items()}
         finished = getattr(self.done, self.unit) >= self.total
         torch.save(dict(config=config, stage=self.stage, log=self.log, done=vars(self.done),
-                        finished=finished) | state, file)
+                        finished=finished, inputs=self.inputs) | state, file)
         write_whole(self.folder / "config.json", json.dumps(config, indent=2).encode())
         write_whole(self.folder / "metrics.jsonl", self.log.encode())
         write_whole(self.folder / "checkpoint.pt", file.getbuffer())
 
 # === Algorithm 1 ===
 def derived_seed(seed, purpose, index):
-    """A seed of its own for each purpose and index, from the run's."""
-    # DEVIATION: published colours and weights are unseeded, the sampler has seed 0.
+    """A seed of its own for each purpose and index."""
+    # DEVIATION: published, colours and weights are unseeded.
     number = ("finetune", "evaluate", "pretrain", "collect").index(purpose)
     return int(np.random.SeedSequence([seed, number, index]).generate_state(1)[0])
 
@@ -1166,14 +1199,13 @@ def mean_metrics(rows):
 
 def train_video_predictor(cfg, run, videos):
     """Algorithm 1, lines 4–8 (numbers on the right). videos: a Replay."""
-    # Not the student's first weights: Eq. (3) would find their latents aligned.
-    torch.manual_seed(derived_seed(cfg.seed, "pretrain", 0))
+    torch.manual_seed(derived_seed(cfg.seed, "pretrain", 0))  # not the student's weights
     model, done, metrics = VideoPredictor(cfg).to(cfg.device), run.done, []
     optimizer = adam(model, cfg.model_lr)
     run.start("updates", cfg.pretrain_updates, model=model, optimizer=optimizer)
     shown = Replay(run.folder / "episodes")
     if not shown.paths:  # one video stays with the run, for `traverse`
-        shown.add(videos.read(videos.paths[-1]))
+        shown.add(videos.read(videos.paths[-1])[-1000:])  # however long
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
         torch.manual_seed(rng.integers(2**63))  # of all noise
@@ -1184,13 +1216,13 @@ def train_video_predictor(cfg, run, videos):
         terms["model_grad_norm"] = descend(loss, optimizer, cfg.grad_clip)
         metrics.append(check_finite(terms))
         done.updates += 1
-        if done.updates % LOG_EVERY == 0 or done.updates == cfg.pretrain_updates:
+        if done.updates % 100 == 0 or done.updates == cfg.pretrain_updates:
             run.record(update=done.updates, **mean_metrics(metrics))
             metrics = []
 
 def color_phase(cfg, env_steps):
-    """The phase of an episode that begins then, and the env step at which it must end."""
-    switch = int(cfg.switch * cfg.steps)  # once, at the midpoint
+    """The phase of an episode that begins then, and the step at which it must end."""
+    switch = round(cfg.switch * cfg.steps)  # once, at the midpoint
     return ("train", switch) if env_steps < switch else ("shifted", cfg.steps)
 
 def current_eta(cfg, decisions):
@@ -1204,10 +1236,13 @@ def train_agent(cfg, run, env, agent):
     """Algorithm 1, lines 9–26 (numbers on the right): act, and learn."""
     replay, done = Replay(run.folder / "episodes", agent_row(agent.action_dim)), run.done
     if replay.paths and not (run.resumes or run.fresh):
-        raise UserError(f"{run.folder} has episodes and no checkpoint; start over with --fresh")
-    run.start("env_steps", cfg.steps, agent=agent, replay=replay, **agent.optimizers)
+        raise UserError(f"{run.folder} has no checkpoint; start over with --fresh")
+    run.start("env_steps", cfg.steps, agent=agent, **agent.optimizers)
+    replay.keep(done.episodes)
+    if cfg.steps < (cfg.prefill + cfg.train_every) * cfg.action_repeat:
+        log.info("warning: --steps end before an update, after --prefill %d", cfg.prefill)
     while done.env_steps < cfg.steps:  # 10: while not converged
-        # 9: random episodes, until all that the first updates are to see is there.
+        # 9: random episodes, until the first updates have all their data.
         learning = done.decisions >= cfg.prefill and replay.bounds[-1] >= cfg.batch_length
         phase, end = color_phase(cfg, done.env_steps)
         seed = derived_seed(cfg.seed, run.stage, done.episodes)
@@ -1243,9 +1278,9 @@ def train_agent(cfg, run, env, agent):
         run.record(**row)
 
 def evaluate_agent(cfg, env, agent, phase, explore=False):
-    """Play episodes, the same seeds every time, with the actor's mode, explore: its samples or,
-    agent None, at random → dict of phase, return, std, returns, success; the last episode."""
-    # DEVIATION: the paper does not say in which colours; here, training's or metal.
+    """Play the same seeds by the actor's mode, explore: its samples or, agent None, at random
+    → dict of phase, return, std, returns, success; the last episode."""
+    # DEVIATION: the paper does not say in which colours.
     phase = "eval" if family(cfg.dst) == "drawer" else phase
     torch.manual_seed(cfg.seed)
     returns, successes = [], []
@@ -1280,20 +1315,19 @@ def open_run(path, **changes):
             model.load_state_dict(saved["agent"])
     return cfg, model, saved
 
-def finished_runs(folder):
-    """Checkpoints of finished runs like a folder's, that of its own seed first."""
-    paths = sorted(folder.parent.glob("seed*/checkpoint.pt"),
-                   key=lambda path: (path.parent != folder, path))
-    return [path for path in paths if read_checkpoint(path)["finished"]]
+def finished_run(folder):
+    """The checkpoint of a finished run of any seed, a folder's own first; or None."""
+    paths = folder / "checkpoint.pt", *sorted(folder.parent.glob("seed*/checkpoint.pt"))
+    done = (path for path in paths if path.exists() and read_checkpoint(path)["finished"])
+    return next(done, None)
 
 def find_teacher(cfg):
-    """A video predictor to learn from: --teacher, or one of --src and --method."""
-    found = [cfg.teacher] if cfg.teacher else finished_runs(run_folder(cfg, "pretrain"))
+    """--teacher, or a finished pretraining → its path, its model"""
+    path = cfg.teacher or finished_run(run_folder(cfg, "pretrain"))
     command = (f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method} "
                f"--seed {cfg.seed} --runs {cfg.runs}, with the same --preset")
-    if not found:
+    if not path:
         raise UserError(f"no teacher of {cfg.src} in {cfg.runs}; {command}")
-    path = found[0]
     own, video, saved = open_run(path, device=cfg.device, threads=cfg.threads)
     if saved["stage"] != "pretrain" or not saved["finished"]:
         raise UserError(f"{path} is no finished pretraining; {command}")
@@ -1301,46 +1335,38 @@ def find_teacher(cfg):
     for name in ("src", "encoder", "z_dim", "cnn_depth", *sizes):
         if getattr(own, name) != getattr(cfg, name):
             raise UserError(f"{path} does not fit; add {flag_name(name)} {getattr(own, name)}")
-    log.info("teacher: %s", path)
-    return video
+    return path, video
 
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1)."""
-    # Training's colours throughout. What only pretraining sets is left out.
+    # In the first colours, and without what only pretraining sets.
     cfg = replace(cfg, dst=cfg.src, method="dreamerv2", steps=cfg.collect_steps, switch=1.0,
                   pretrain_updates=1, z_dim=1, beta1=0.0, **METHODS["dreamerv2"])
-    run = Run(cfg, "collect", fresh)
-    with config_env(cfg, cfg.src) as env:
-        torch.manual_seed(cfg.seed)  # of the weights
-        train_agent(cfg, run, env, Agent(cfg, *env.action_space.shape))
-    return run.folder
+    return finetune(cfg, fresh, "collect")
 
 def pretrain(cfg, fresh=False):
     """Train the β-VAE video predictor (stage 2; collects videos first if there are none)."""
-    check_task(cfg.src)
     cfg = replace(cfg, dst=cfg.src)
     run = Run(cfg, "pretrain", fresh)
     folder = cfg.videos
     if not folder:
-        found = finished_runs(run_folder(replace(cfg, method="dreamerv2"), "collect"))
-        folder = (found[0].parent if found else collect(cfg)) / "episodes"
+        found = finished_run(run_folder(replace(cfg, method="dreamerv2"), "collect"))
+        folder = (found.parent if found else collect(cfg)) / "episodes"
     videos = Replay(folder)
     if videos.bounds[-1] < cfg.batch_length:
-        raise UserError(f"{folder} has {videos.bounds[-1]} frames in *.npy, a window takes "
-                        f"{cfg.batch_length}; run: python diswm.py collect --src {cfg.src}")
-    log.info("videos: %s, %d episodes, %d frames", folder, len(videos.paths), videos.bounds[-1])
+        raise UserError(f"{folder} has {videos.bounds[-1]} frames in *.npy, too few; {IMPORT}")
+    run.check_input("videos", folder, videos.paths)
     train_video_predictor(cfg, run, videos)
     return run.folder
 
-def finetune(cfg, fresh=False):
+def finetune(cfg, fresh=False, stage="finetune"):
     """Distil, adapt and learn behaviour in the target task (stage 3)."""
-    check_task(cfg.src)
-    check_task(cfg.dst)
-    if cfg.src == cfg.dst:
-        raise UserError(f"source and target are both {cfg.src}; choose another --src")
-    run, video = Run(cfg, "finetune", fresh), None
-    if not run.resumes and (cfg.eta > 0 or cfg.carry_over != "none"):
-        video = find_teacher(cfg)
+    if cfg.src == cfg.dst and stage == "finetune":
+        raise UserError(f"--src and --dst are both {cfg.src}; choose another")
+    run, video = Run(cfg, stage, fresh), None
+    if (cfg.eta > 0 or cfg.carry_over != "none") and (cfg.teacher or not run.resumes):
+        path, video = find_teacher(cfg)
+        run.check_input("teacher", path, [path])
     with config_env(cfg, cfg.dst) as env:
         torch.manual_seed(cfg.seed)  # of the weights
         agent = Agent(cfg, *env.action_space.shape)
@@ -1351,28 +1377,29 @@ def finetune(cfg, fresh=False):
         train_agent(cfg, run, env, agent)
     return run.folder
 
-def evaluate(run, **changes):
+def evaluate(run, out=None, **changes):
     """Play a run's policy by mode and by samples, and a random one, to JSON and mp4 (stage 4)."""
     cfg, agent, saved = open_run(run / "checkpoint.pt", **changes)
     if not isinstance(agent, Agent):
-        raise UserError(f"{run} is a video predictor without a policy; give a finetune run")
+        raise UserError(f"{run} has no policy; give a finetune run")
+    out = out or run
+    out.mkdir(parents=True, exist_ok=True)
+    if not os.access(out, os.W_OK):
+        raise UserError(f"{out} is read-only; add --out FOLDER")
     step = saved["done"]["env_steps"]
     phase, _ = color_phase(cfg, min(step, cfg.steps - 1))  # as in training
+    result = dict(task=cfg.dst, step=step)
     with config_env(cfg, cfg.dst) as env:
         if env.action_space.shape != (agent.action_dim,):
             raise UserError(f"{run} has {agent.action_dim} actions, unlike {cfg.dst}")
-        result, episode = evaluate_agent(cfg, env, agent, phase)
-        sampled, _ = evaluate_agent(cfg, env, agent, phase, explore=True)
-        random, _ = evaluate_agent(cfg, env, None, phase)
-    log.info("%s, %s colours", cfg.dst, result["phase"])
-    for name, played in (("mode", result), ("samples", sampled), ("random", random)):
-        log.info("%s: return %.1f ± %.1f", name, played["return"], played["std"])
-    result |= {f"sampled_{name}": value for name, value in sampled.items()}
-    result |= {f"random_{name}": value for name, value in random.items()}
-    result |= dict(task=cfg.dst, step=step)
+        for prefix, policy in (("random_", None), ("sampled_", agent), ("", agent)):
+            played, episode = evaluate_agent(cfg, env, policy, phase, explore=prefix != "")
+            result |= {prefix + name: value for name, value in played.items()}
+            log.info("%s, %s colours: %sreturn %.1f ± %.1f", cfg.dst, played["phase"], prefix,
+                     played["return"], played["std"])
     frames = np.stack([row["image"] for row in episode.rows]).repeat(4, 1).repeat(4, 2)
-    iio.imwrite(run / "evaluation.mp4", frames, fps=25)  # 256 × 256
-    (run / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
+    write_whole(out / "evaluation.mp4", iio.imwrite("<bytes>", frames, extension=".mp4", fps=25))
+    write_whole(out / "evaluation.json", json.dumps(result, indent=2).encode())
     return result
 
 # === Figures: traverse and doctor ===
@@ -1424,7 +1451,7 @@ def draw_grid(pictures, rows, columns, path, title=""):
     axes.figure.savefig(path, dpi=100, bbox_inches="tight")
     log.info("wrote %s", path)
 
-def traverse(run, **changes):
+def traverse(run, out=None, **changes):
     """Draw a run's open_loop.png and, of a β-VAE, traversal.png, from its last episode."""
     cfg, model, _ = open_run(run / "checkpoint.pt", **changes)
     dtype = VIDEO_ROW
@@ -1433,20 +1460,19 @@ def traverse(run, **changes):
     replay = Replay(run / "episodes", dtype)
     if not replay.paths:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
-    # From the middle of the last one: the colours of the end, not the first pose.
     rows = replay.read(replay.paths[-1])
-    rows = rows[len(rows) // 2:][:50]
+    rows = rows[len(rows) // 2:][:50]  # the last colours
     batch = to_device({name: np.array(rows[name])[None] for name in dtype.names}, cfg.device)
     batch["is_first"][:, 0] = True
     torch.manual_seed(cfg.seed)
     strip = open_loop(model, batch)[:, ::4]
     draw_grid(strip, ("truth", "model", "error"), range(0, 4 * strip.shape[1], 4),
-              run / "open_loop.png", "predicted, not seen: frames 5 …")
+              (out or run) / "open_loop.png", "predicted, not seen: frames 5 …")
     if cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
         pictures, nats = latent_traversal(model, batch)
         order = np.argsort(-nats)  # informative first
         labels = [f"z{i}  {nats[i]:.2f} nats" for i in order]
-        draw_grid(pictures[order], labels, ["recon.", *TRAVERSAL], run / "traversal.png")
+        draw_grid(pictures[order], labels, ["recon.", *TRAVERSAL], (out or run) / "traversal.png")
 
 def doctor(tasks=FAMILIES):
     """Render each phase of tasks into doctor.png (Fig. 3), and say what runs here."""
@@ -1459,18 +1485,17 @@ def doctor(tasks=FAMILIES):
     draw_grid(pictures, tasks, PHASES, "doctor.png")
 
 # === Command line ===
-COLLECT = "src seed runs collect_steps environment acting models behaviour machine "
+COLLECT = "preset src seed runs collect_steps environment acting models behaviour machine "
 COMMANDS = dict(  # groups of Config's fields, and single ones, that are flags of each
     collect=COLLECT,
     pretrain=COLLECT + "method videos pretrain_updates encoder z_dim beta1 beta2",
-    finetune="src dst method seed runs teacher steps switch environment acting models encoder "
-             "carry_over bonus z_dim beta distillation behaviour machine",
+    finetune="preset src dst method seed runs teacher steps switch environment acting models "
+             "encoder carry_over bonus z_dim beta distillation behaviour machine",
     evaluate="dst seed environment eval_episodes device threads",
     traverse="seed device threads", doctor="")
 
 class Parser(argparse.ArgumentParser):
-    """argparse whose errors are one line."""
-    def error(self, message):
+    def error(self, message):  # one line
         raise UsageError(f"{message}; {self.format_usage()}")
 
 def add_config_flags(parser, used, defaults):
@@ -1482,8 +1507,7 @@ def add_config_flags(parser, used, defaults):
             group, section = title[2], parser.add_argument_group(title[1])
         if entry and {group, entry[1]} & set(used):
             name, default = entry[1], getattr(defaults, entry[1])
-            choices = METHODS if name == "method" else CHOICES.get(name)
-            options = dict(type=type(default), choices=choices)
+            options = dict(type=type(default), choices=CHOICES.get(name))
             if type(default) is bool:
                 options = dict(action=argparse.BooleanOptionalAction)
             section.add_argument(flag_name(name), dest=name, default=argparse.SUPPRESS,
@@ -1504,10 +1528,10 @@ def parse_args(argv):
         if name == "doctor":
             sub.add_argument("tasks", nargs="*", metavar="TASK", default=FAMILIES)
         elif name in ("evaluate", "traverse"):
-            sub.add_argument("--run", type=Path, required=True, help="its folder: runs/…/seed0")
+            sub.add_argument("--run", type=lambda path: Path(path.removesuffix("checkpoint.pt")),
+                             required=True, help="its folder: runs/…/seed0")
+            sub.add_argument("--out", type=Path, help="where to write; default: --run")
         else:
-            sub.add_argument("--preset", choices=PRESETS, default=chosen.preset,
-                             help="sizes; default: paper on CUDA, else small")
             sub.add_argument("--fresh", action="store_true", help="start over, do not resume")
         if name in argv[:1]:  # reading Config's source takes 40 ms
             add_config_flags(sub, used.split(), defaults)
@@ -1517,23 +1541,23 @@ def parse_args(argv):
     return vars(given), defaults
 
 def main(argv=None):
-    """Run a command. A user's mistake is one line and exit code 1 or 2. Returns the code."""
+    """Run a command. A user's mistake is one line. Returns the exit code."""
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stdout, force=True)
     try:
         given, defaults = parse_args(sys.argv[1:] if argv is None else argv)
         command = globals()[given.pop("command")]
-        if "preset" in given:
-            log.info("preset %s", given.pop("preset"))
+        if "fresh" in given:
+            log.info("preset %s", defaults.preset)
             fresh = given.pop("fresh")
             given = dict(cfg=prepare_machine(replace(defaults, **given)), fresh=fresh)
         command(**given)
         return 0
     except UserError as error:
         message, code = str(error), 2 if isinstance(error, UsageError) else 1
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
         message, code = f"{error}; mend that and run the same command again", 1
     except KeyboardInterrupt:
-        message, code = "interrupted; the same command goes on from the last checkpoint", 130
+        message, code = "interrupted; run it again: training goes on from its checkpoint", 130
     print("error:", " ".join(message.split()), file=sys.stderr)
     return code
 

@@ -14,6 +14,7 @@ import inspect
 import io
 import itertools
 import json
+import multiprocessing
 import os
 import re
 import runpy
@@ -1195,7 +1196,7 @@ class ReplayMachine(stateful.RuleBasedStateMachine):
         self.tmp = tempfile.TemporaryDirectory()
         self.folder, self.count, self.episodes = Path(self.tmp.name) / "episodes", 0, []
         self.replay = Replay(self.folder, ROWS)
-        self.saved = self.replay.state_dict(), []
+        self.saved = []
 
     @property
     def flat(self):
@@ -1229,7 +1230,7 @@ class ReplayMachine(stateful.RuleBasedStateMachine):
 
     @stateful.rule()
     def checkpoint(self):
-        self.saved = self.replay.state_dict(), list(self.episodes)
+        self.saved = list(self.episodes)
 
     @stateful.rule()
     def reopen(self):
@@ -1241,8 +1242,8 @@ class ReplayMachine(stateful.RuleBasedStateMachine):
     @stateful.rule()
     def go_back_to_checkpoint(self):
         """A run that was cut off before its next checkpoint: later episodes go."""
-        self.replay.load_state_dict(self.saved[0])
-        self.episodes = list(self.saved[1])
+        self.replay.keep(len(self.saved))
+        self.episodes = list(self.saved)
 
     @stateful.invariant()
     def holds_the_same_rows_and_no_others(self):
@@ -1281,12 +1282,13 @@ def test_episodes_are_plain_arrays_of_which_none_may_be_missing(tmp_path):
     assert set(file.dtype.names) == set(FIELDS) and file["discount"].tolist() == [1, 1, 1, 0]
     (tmp_path / "000000.npy").unlink()
     with pytest.raises(UserError, match="--fresh"):
-        Replay(tmp_path, ROWS).load_state_dict(replay.state_dict())
+        Replay(tmp_path, ROWS).keep(1)
 
 
 class CountingSimulator(FakeEnv):
     """Nothing but a counter: step n rewards n + action / 2; step 3, and no other, succeeds."""
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     mujoco_renderer = SimpleNamespace(default_cam_config=None)
     data = mujoco.MjData(model)
 
@@ -1396,12 +1398,12 @@ def test_every_task_is_a_gymnasium_env_with_64_by_64_pixels_and_bounded_actions(
         check_env(env, skip_render_check=True, skip_close_check=True)
 
 
-@pytest.mark.parametrize("task", [*diswm.FAMILIES, "quadruped_escape", "lqr_lqr_2_1"])
-def test_same_seed_gives_the_same_pixels_and_another_seed_others(task):
+@pytest.mark.parametrize("task", [*diswm.FAMILIES, "quadruped_escape", "HandManipulateBlock-v1"])
+def test_same_seed_gives_the_same_whatever_was_played_before_and_another_seed_others(task):
     """The published code leaves its colours unseeded; Meta-World ignores reset(seed); quadruped has
-    a new terrain, which only its own renderer shows; lqr draws its springs as it is made."""
+    a new terrain, which only its own renderer shows; a hand's reset leaves its warm start."""
     with make_env(task, phase="shifted") as one, make_env(task, seed=3) as two:
-        other, *_ = play(two, 6, phase="eval")
+        *_, other = play(two, 6, 15, phase="eval")
         for first, again in zip(play(one, 5), play(two, 5, phase="shifted"), strict=True):
             assert np.array_equal(first[0], again[0]) and first[1:] == again[1:]
             assert not np.array_equal(first[0], other[0])
@@ -1427,6 +1429,47 @@ def test_each_phase_looks_different_and_none_is_the_task_as_it_is(task):
         grid, wood, metal, _ = (view[50:, 12:50].mean((0, 1)) for view in views)
         assert grid[2] > 1.3 * grid[0] and wood[0] > 1.3 * wood[2] and np.ptp(metal) < metal[0] / 9
         assert max(np.abs(view - none)[30:36, :12].mean() for view in views) < 10
+
+
+def moving_share(task):
+    """Which part of the picture can move, by MuJoCo's segmentation, at three episodes' starts."""
+    shares, kinds = [], mujoco.mjtObj
+    with make_env(task, phase="none") as env:
+        env.renderer.enable_segmentation_rendering()
+        model = env.unwrapped.model
+        for picture, *_ in (row for seed in range(3) for row in [*play(env, seed, 4 * seed)][::4]):
+            index, kind = np.moveaxis(picture, -1, 0)
+            moves = kind == kinds.mjOBJ_SKIN
+            for drawn, bodies in ((kinds.mjOBJ_GEOM, model.geom_bodyid),
+                                  (kinds.mjOBJ_SITE, model.site_bodyid)):
+                moves[kind == drawn] = model.body_weldid[bodies[index[kind == drawn]]] != 0
+            shares.append(moves.mean())
+    return np.mean(shares)
+
+
+@pytest.mark.parametrize("task", [
+    "acrobot_swingup", "ball_in_cup_catch", "cartpole_three_poles", "fish_swim", "quadruped_run",
+    "pendulum_swingup", "swimmer_swimmer15", "Reacher-v5", "InvertedDoublePendulum-v5",
+    "PointMaze_UMaze-v3", pytest.param("all", marks=slow)])
+def test_the_agent_is_in_the_picture(task):
+    """At least 1 % of it, but of dots in an arena, whose goal a closer camera would lose."""
+    diswm.check_task("FetchReach-v4")  # registers the robotics ids
+    newest = {spec.name: spec.id for spec in sorted(
+        gym.registry.values(), key=lambda spec: spec.version or 0) if "Dense" not in spec.name
+        and re.search(r"gymnasium(\.envs\.mujoco|_robotics)", str(spec.entry_point))}
+    every = *TASKS, *diswm.OTHER_TASKS, *newest.values()
+    for name in every if task == "all" else [task]:
+        dot = name.startswith(("point_mass", "PointMaze"))
+        assert moving_share(name) >= (0.0004 if dot else 0.01), name
+
+
+def test_camera_names_one_of_the_tasks_cameras(tmp_path):
+    """walker_walk's first one is "side"; the error says which there are."""
+    with (make_env("walker_walk") as usual, make_env("walker_walk", camera="side") as side,
+          make_env("walker_walk", camera="back") as back):
+        assert (usual.render() == side.render()).all() and (usual.render() != back.render()).any()
+    refuse("collect", "--src", "walker_walk", "--camera", "front", "--runs", tmp_path, *DEBUG,
+           says="no camera 'front'; walker_walk has: side, back")
 
 
 @pytest.mark.parametrize("task", ["drawer_open", "drawer_close", "FetchReach-v4"])
@@ -1541,9 +1584,11 @@ def test_planted_action_repeat_bug_is_noticed(weights, monkeypatch):
 
 @pytest.mark.parametrize("task, given, repeat, limit", [
     ("walker_walk", 7, 2, 7), ("walker_walk", 0, 30, 1000), ("pusher", 0, 30, 100),
-    ("drawer_open", 0, 30, 200), ("FetchReach-v4", 0, 30, 50), ("HalfCheetah-v5", 8, 2, 8)])
+    ("drawer_open", 0, 30, 200), ("FetchReach-v4", 0, 30, 50), ("HalfCheetah-v5", 8, 2, 8),
+    ("walker_walk", 1010, 30, 1010), ("drawer_open", 510, 30, 510)])
 def test_time_limit_counts_env_steps_and_is_no_terminal(task, given, repeat, limit):
-    """By default the task's own. A repeat that it cuts short counts the steps that were made."""
+    """By default the task's own. A repeat that it cuts short counts the steps that were made. The
+    bug it kills: a limit above the simulator's own was cut to that, unsaid."""
     with make_env(task, time_limit=given, action_repeat=repeat) as env:
         env.reset(seed=0)
         steps, over = 0, False
@@ -1553,13 +1598,29 @@ def test_time_limit_counts_env_steps_and_is_no_terminal(task, given, repeat, lim
     assert steps == limit and truncated and not terminated
 
 
+def test_gymnasium_finds_its_conventions_kept():
+    """render_mode, decisions a second, a spec that goes through JSON; an unknown phase."""
+    env = gym.make("DisWM/walker_walk-v0", render_mode="rgb_array", action_repeat=4, size=32)
+    assert env.render_mode == "rgb_array" and env.metadata["render_fps"] == pytest.approx(10)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert np.array_equal(env.reset(seed=1)[0], again.reset(seed=1)[0])
+    with pytest.raises(UserError, match="'nigth'.*train, shifted, eval, none"):
+        env.reset(options=dict(phase="nigth"))
+    assert env.reset(seed=1)[0].shape == (32, 32, 3)
+
+
 def test_ten_envs_alive_at_once_do_not_mix_textures():
-    """gymnasium's renderer forgets to switch GL contexts: one env gets the other's textures."""
+    """gymnasium's renderer forgets to switch GL contexts: one env gets the other's textures. Nor
+    does a terrain, for which dm_control made a context of its own, that outlived close()."""
     kinds = [(task, phase) for task in diswm.FAMILIES for phase in ("train", "shifted")]
     alone = []
     for task, phase in kinds:
         with make_env(task, phase=phase) as env:
             alone.append([*play(env, 2, 2)])
+    with make_env("quadruped_escape") as env:
+        assert env.unwrapped.env.physics.contexts is None
+        scene = env.renderer.scene  # the rangefinder's rays covered the picture
+        assert mujoco.mjtGeom.mjGEOM_LINE not in [g.type for g in scene.geoms[:scene.ngeom]]
     with contextlib.ExitStack() as stack:
         plays = [zip(play(stack.enter_context(make_env(task, phase=phase)), 2, 2), rows,
                      strict=True) for (task, phase), rows in zip(kinds, alone, strict=True)]
@@ -1588,6 +1649,31 @@ if __name__ == "__main__":
                           env=os.environ | dict(PYTHONPATH=str(Path(diswm.__file__).parent)))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert {f"DisWM/{name}-v0" for name in PAPER_TASKS} <= gym.registry.keys()
+
+
+FIRST = "import mujoco, dm_control.suite, gymnasium.envs.mujoco.mujoco_rendering, diswm"
+
+
+@pytest.mark.parametrize("gl, argv, code", [
+    (None, ["-c", f"{FIRST}; diswm.make_env('walker_walk')"], 0),
+    *((gl, [diswm.__file__, "doctor", "walker_walk"], gl != " EGL")
+      for gl in (" EGL", "bogus", "glfw"))])
+def test_any_mujoco_gl_and_order_of_imports_works_or_is_one_line(gl, argv, code, tmp_path):
+    """Without a display: EGL, or one line that names it; no traceback, at the end either."""
+    unset = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")
+    env = {name: value for name, value in os.environ.items() if name not in unset}
+    env |= dict(PYTHONPATH=str(README.parent)) | (dict(MUJOCO_GL=gl) if gl else {})
+    done = subprocess.run([sys.executable, "-W", "ignore", *argv], capture_output=True, text=True,
+                          env=env, cwd=tmp_path)
+    assert done.returncode == code == done.stderr.count("\n"), done.stderr
+    assert ("export MUJOCO_GL=egl" in done.stderr) == code
+
+
+def test_a_forked_process_says_what_to_do_instead_of_hanging():
+    """gymnasium.make_vec(…, vectorization_mode="async") forks by default: OpenGL hung there."""
+    with (pytest.raises(UserError, match='context="spawn"'),
+          multiprocessing.get_context("fork").Pool(1) as pool):
+        pool.apply_async(make_env, ("walker_walk",)).get(20)
 
 
 @pytest.mark.parametrize("cut", [2, 3, 4, 99])
@@ -1648,12 +1734,12 @@ REFUSED = {  # why: (the command's words, what it says)
     "other latents": ("finetune --z-dim 10 --teacher {teacher}", "add --z-dim 20"),
     "no latents": ("finetune --encoder conv --teacher {teacher}", "add --encoder beta_vae"),
     "weights": ("finetune --carry-over weights --hidden 7 --teacher {teacher}", "add --hidden 10"),
-    "source is target": ("finetune --dst cheetah_run --teacher {teacher}", "choose another --src"),
+    "source is target": ("finetune --dst cheetah_run --teacher {teacher}", "both cheetah_run"),
     "no such target": ("finetune --dst walker_wak --teacher {teacher}", "walker_walk"),
     "no such source": ("finetune --src cheetah_rum --teacher {teacher}", "cheetah_run"),
     "discrete actions": ("finetune --dst CartPole-v1 --teacher {teacher}", "continuous actions"),
     "wrong value": ("finetune --teacher {teacher} --batch-size 0", "--batch-size 0"),
-    "no videos": ("pretrain --videos .", "python diswm.py collect --src cheetah_run"),
+    "no videos": ("pretrain --videos .", "results/import_videos.py"),
     "nothing to pretrain for": ("pretrain --src cheetah_rum", "cheetah_run"),
     "nothing to collect": ("collect --src cheetah_rum", "cheetah_run"),
     "no run to evaluate": ("evaluate --run lost", "python diswm.py finetune"),
@@ -1706,23 +1792,23 @@ def test_other_seeds_and_other_pretrainings_reuse_one_finished_video_set(files, 
     shutil.copytree(files["set"].parent, sets / "seed0")
     argv = ("pretrain", "--runs", tmp_path, *DEBUG, "--pretrain-updates", 2)
     said = succeed(*argv, "--z-dim", 10) + succeed(*argv, "--seed", 1)
-    assert said.count(f"videos: {sets / 'seed0/episodes'}, ") == 2
+    assert said.count(f"--videos {sets / 'seed0/episodes'} of sha256") == 2
     assert [path.name for path in sets.iterdir()] == ["seed0"]
     state = torch.load(sets / "seed0/checkpoint.pt")
     state["finished"] = False
     torch.save(state, sets / "seed0/checkpoint.pt")
-    assert f"videos: {sets / 'seed2/episodes'}, " in succeed(*argv, "--seed", 2)
+    assert f"--videos {sets / 'seed2/episodes'} of" in succeed(*argv, "--seed", 2)
 
 
-def test_other_seeds_and_targets_reuse_one_teacher_but_prefer_their_own(teacher, tmp_path, caplog):
+def test_other_seeds_and_targets_reuse_one_teacher_but_prefer_their_own(teacher, tmp_path):
     """Only what it gives has to fit: with distillation alone, the student's RSSM is its own."""
     found, pretrained = [0, 0, 3, 0], tmp_path / "pretrain/cheetah_run/diswm"
     for seed in set(found):
         shutil.copytree(teacher.parent, pretrained / f"seed{seed}")
-    with caplog.at_level("INFO", "diswm"):
-        for changes in ({}, dict(seed=1, dst="pusher"), dict(seed=3), dict(stoch=7, hidden=8)):
-            diswm.find_teacher(tiny_config(runs=str(tmp_path), **changes))
-    assert caplog.messages == [f"teacher: {pretrained}/seed{seed}/checkpoint.pt" for seed in found]
+    for seed, changes in zip(found, ({}, dict(seed=1, dst="pusher"), dict(seed=3),
+                                     dict(stoch=7, hidden=8)), strict=True):
+        path, _ = diswm.find_teacher(tiny_config(runs=str(tmp_path), **changes))
+        assert path == pretrained / f"seed{seed}/checkpoint.pt"
 
 
 @pytest.mark.parametrize("method, carry_over", [
@@ -1782,7 +1868,7 @@ def test_finetuning_leaves_its_teacher_as_it_was_and_goes_on_without_it_bit_for_
         gc.collect()  # the lock goes with the run
         assert video.read_bytes() == source.read_bytes()
         video.unlink()
-        state = torch.load(diswm.finetune(cfg) / "checkpoint.pt")
+        state = torch.load(diswm.finetune(dataclasses.replace(cfg, teacher="")) / "checkpoint.pt")
         ends.append(state["agent"])
     agent, resumed = ends
     assert state["done"]["updates"] > 5 and agent.keys() == resumed.keys()
@@ -1838,6 +1924,17 @@ def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
     for decisions, *_, eta in updates:
         expected = 0 if decisions < delay else max(0.1 * (1 - (decisions - delay) / decay), 0.01)
         assert eta == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("steps, short", [(118, True), (120, False)])
+def test_a_run_too_short_for_an_update_warns_at_its_start(
+        steps, short, tmp_path, caplog, monkeypatch):
+    """50 decisions of prefill, an update per 10. Nor does a clock set back make rates negative."""
+    caplog.set_level("INFO", "diswm")
+    monkeypatch.setattr("tqdm.std.time", itertools.count(1e9, -60).__next__)
+    run = train_fake(tiny_config("dreamerv2", steps=steps, eval_episodes=1), tmp_path).run
+    assert ("warning: --steps end" in caplog.messages[1]) == short == (run.done.updates == 0)
+    assert min(row["rate"] for row in log_rows(run.folder)) > 0
 
 
 @pytest.mark.parametrize("cut", [1, 2, 3, 99])
@@ -1912,7 +2009,7 @@ def test_pipeline_logs_every_loss_term_counts_env_steps_and_switches_once(finish
 
 def test_pipeline_evaluates_and_draws(finished, teacher, root):
     """pretrain → finetune → evaluate → traverse on real DMC leaves files that open."""
-    out = succeed("evaluate", *ONE, "--run", finished)
+    out = succeed("evaluate", *ONE, "--run", finished / "checkpoint.pt")
     result = json.loads((finished / "evaluation.json").read_text())
     assert (result["task"], result["phase"], result["step"]) == ("walker_walk", "shifted", 300)
     for name in ("", "sampled_", "random_"):
@@ -1950,7 +2047,47 @@ def test_other_flags_are_refused_with_their_names(copied, tmp_path):
         str(copied), "--beta 0.015 (now 0.5)", "--lambda 0.95 (now 0.5)", "--fresh"))
     refuse("evaluate", "--run", copied, "--dst", "cartpole_swingup", says="6 actions")
     assert all_files(copied) == before
-    succeed(*argv, "--threads", 2, "--teacher", "elsewhere.pt")
+    refuse("finetune", "--runs", tmp_path, *DEBUG[2:], "--preset", "small",
+           says="was started with other flags: add --preset debug (now small), or")
+    succeed(*argv, "--threads", 2)
+
+
+@pytest.mark.parametrize("switch, longer", [(1.0, 1.0), (0.5, 0.25)])
+def test_a_run_goes_on_for_more_steps_but_its_trained_colors_stay(switch, longer, tmp_path):
+    """It equals one that was asked for all steps at once; --switch, a share of them, is said."""
+    def trained(name, **changes):
+        cfg = dataclasses.replace(tiny_config("dreamerv2", eval_episodes=1), **changes)
+        return everything(train_fake(cfg, tmp_path / name).run.folder)
+    trained("run", steps=100, switch=switch)
+    if switch < 1:
+        with pytest.raises(UserError, match="at step 50: add --switch 0.25$"):
+            trained("run", steps=200)
+    more = trained("run", steps=200, switch=longer)
+    assert more["done"]["env_steps"] == 200 and more["done"]["updates"] > 5
+    assert_identical(more, trained("at once", steps=200, switch=longer))
+
+
+def test_videos_and_teacher_are_known_by_content_and_may_not_change(
+        root, teacher, copied, tmp_path):
+    """Else a run mixes two video sets. A folder may move; a missing one is refused."""
+    ours, other, moved = (tmp_path / name for name in ("ours", "other", "moved"))
+    shutil.copytree(root / "runs" / COLLECTED / "episodes", ours)
+    shutil.copytree(ours, other)
+    rows = np.load(other / "000001.npy")
+    rows["image"][5, 5, 5] ^= 1
+    np.save(other / "000001.npy", rows)
+    argv = ("pretrain", "--runs", tmp_path, *DEBUG)
+    interrupt(diswm, "descend", 9, (*argv, "--videos", ours))
+    refuse(*argv, "--videos", other, says=(
+        f"started with --videos {ours} of sha256 ", f", not --videos {other} of sha256 "))
+    succeed(*argv, "--videos", ours.rename(moved))
+    for videos in (other, ours):
+        refuse(*argv, "--videos", videos, says=str(videos))
+    argv, path = ("finetune", "--runs", tmp_path, *DEBUG, "--teacher"), tmp_path / "teacher.pt"
+    refuse(*argv, path, says="no checkpoint")
+    succeed(*argv, shutil.copy(teacher, path))
+    refuse(*argv, tmp_path / PRETRAINED / "checkpoint.pt", says=(
+        f"started with --teacher {teacher} of", f"not --teacher {tmp_path / PRETRAINED}"))
 
 
 def test_a_collect_cut_off_goes_on_whatever_pretraining_is_to_follow(tmp_path):
@@ -1988,7 +2125,7 @@ def test_fresh_loses_nothing_to_a_mistake(copied, teacher, tmp_path, monkeypatch
     assert len(all_files(copied)) == len(before) - 1
 
 
-def test_evaluate_plays_as_it_was_trained_but_for_what_it_is_given(copied):
+def test_evaluate_plays_as_it_was_trained_but_for_what_it_is_given(copied, tmp_path, monkeypatch):
     """The bug it kills: --eval-episodes was accepted, and the run's own number played. The episode
     that the switch ends, and its evaluation, have the first colours."""
     state, returns = torch.load(copied / "checkpoint.pt"), {}
@@ -2000,6 +2137,12 @@ def test_evaluate_plays_as_it_was_trained_but_for_what_it_is_given(copied):
         returns[(step, *flags)] = json.loads((copied / "evaluation.json").read_text())["returns"]
     assert [len(values) for values in returns.values()] == [2, 3, 2]
     assert len({values[0] for values in returns.values()}) == 3
+    before = all_files(copied)
+    interrupt(iio, "imwrite", 1, ("evaluate", *ONE, "--run", copied))
+    monkeypatch.setattr(os, "access", lambda path, mode: not copied.samefile(path))
+    refuse("evaluate", *ONE, "--run", copied, says=f"{copied} is read-only; add --out")
+    succeed("evaluate", *ONE, "--run", copied, "--out", tmp_path / "of/mine")
+    assert all_files(copied) == before and len(all_files(tmp_path / "of/mine")) == 2
 
 
 @pytest.mark.parametrize("method", ["dreamerv2", "no_distill"])
@@ -2168,7 +2311,7 @@ def interrupt(owner, name, call, argv):
     """Run a command with a Ctrl-C in it: it exits 130, in one line, and it really fell there."""
     with pytest.MonkeyPatch.context() as patch:
         count = before_call(patch, owner, name, call, lambda: signal.raise_signal(signal.SIGINT))
-        refuse(*argv, code=130, says="the same command goes on")
+        refuse(*argv, code=130, says="training goes on from")
     assert count[0] >= call, f"{name} was called only {count[0]} times"
 
 
@@ -2186,6 +2329,7 @@ def everything(run):
     assert state.pop("log") == (run / "metrics.jsonl").read_text()
     config = state.pop("config").items()
     return state | dict(
+        inputs={name: said[-12:] for name, said in state["inputs"].items()},  # no paths
         config={name: value for name, value in config if name not in diswm.MAY_CHANGE},
         rows=[{name: value for name, value in row.items() if name not in ("seconds", "rate")}
               for row in log_rows(run)],
@@ -2419,6 +2563,8 @@ def test_nan_stops_the_run_by_name_and_saves_nothing(loss, broken, term, root, u
     ("finetune --dst walker_wlak", "unknown walker_walk cartpole_swingup"),
     ("pretrain --src drawer", "unknown drawer_open"),
     ("finetune --dst HalfCheeta-v5 --method dreamerv2", "near: HalfCheetah-v5"),
+    ("finetune --dst DisWM/drawer_open-v0", "near: drawer_open"),
+    ("collect --src lqr_lqr_2_1", "unknown lqr_lqr_2_1"),
     ("collect --src FetchReach", "near: FetchReach-v4"), ("finetune --dst qqq", "near: none"),
     ("finetune --batchsize 1", "--batchsize --batch-size"), ("evaluate", "--run"), ("", "COMMAND"),
     ("collect walker_walk", "walker_walk --src --preset"), ("finetune --qqq", "--qqq --batch-size"),
@@ -2435,6 +2581,16 @@ def test_wrong_usage_exits_2_and_lists_what_is_near(argv, says, workdir, monkeyp
     monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
     refuse(*argv.split(), code=2, says=says.split())
     assert not list(workdir.iterdir())
+
+
+def test_a_copy_under_another_name_runs_itself(tmp_path):
+    """The bug it kills: the last lines imported `diswm`, the unedited file or none."""
+    source = Path(diswm.__file__).read_text()
+    (tmp_path / "mine.py").write_text(source.replace("distracting source task", "changed copy"))
+    (tmp_path / "diswm.py").write_text("raise SystemExit('the other file')")
+    done = subprocess.run([sys.executable, "-W", "ignore", tmp_path / "mine.py", "--help"],
+                          capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "") and "Learn in the changed copy" in done.stdout
 
 
 def test_checkpoint_with_a_payload_is_refused_and_not_executed(teacher, tmp_path, monkeypatch):
@@ -2458,7 +2614,8 @@ def test_file_that_is_no_checkpoint_of_ours_is_refused(teacher, tmp_path):
     cuts = [whole[:length] for length in np.linspace(1, len(whole) - 1, 20, dtype=int)]
     for content in (b"", b"PK\x03\x04 not a zip", b"hello\n" * 99, b"\x80\x02.", *cuts,
                     {"weight": torch.ones(2)}, (1, 2), torch.ones(3), {"config": 3},
-                    ours | dict(config=ours["config"] | dict(envs=1)), ours | dict(model={})):
+                    ours | dict(config=ours["config"] | dict(envs=1)), ours | dict(model={}),
+                    ours | dict(config=ours["config"] | dict(gamma=-1.0))):
         if isinstance(content, bytes):
             path.write_bytes(content)
         else:
@@ -2488,11 +2645,12 @@ def test_no_path_in_a_checkpoint_is_followed(teacher, finished, tmp_path):
 
 
 @pytest.mark.parametrize("rows, says", [
-    (np.zeros((12, 64, 64, 3), np.uint8), "bad.npy remove uint8"),
-    (np.zeros(12, [("image", np.float32, (64, 64, 3)), ("is_first", bool)]), "bad.npy remove f4"),
-    (np.zeros(12, [("image", np.uint8, (64, 64, 3))]), "bad.npy remove is_first"),
-    (np.array([{}, None], object), "bad.npy remove Python objects"),
-    (np.zeros(7, diswm.VIDEO_ROW), "7 frames of 8 python diswm.py collect --src cheetah_run")],
+    (np.zeros((12, 64, 64, 3), np.uint8), "bad.npy import_videos.py uint8"),
+    (np.zeros(12, [("image", np.float32, (64, 64, 3)), ("is_first", bool)]),
+     "bad.npy import_videos.py f4"),
+    (np.zeros(12, [("image", np.uint8, (64, 64, 3))]), "bad.npy import_videos.py is_first"),
+    (np.array([{}, None], object), "bad.npy import_videos.py Python objects"),
+    (np.zeros(7, diswm.VIDEO_ROW), "7 frames too few import_videos.py")],
     ids=["plain array", "float images", "no is_first", "objects", "less than a window"])
 def test_foreign_video_is_one_line(rows, says, tmp_path):
     """It names the file and what is wrong with it; nothing is unpickled."""
@@ -2695,22 +2853,65 @@ def test_bench_reports_times_memory_and_parameters_as_one_json_object(capsys):
     assert result["params"].pop("total") == sum(result["params"].values()) > 0
 
 
-def test_imported_videos_are_learnt_from(tmp_path):
-    """Like the authors': compressed, with other arrays, no is_first; or in Fortran's order."""
-    image = np.random.default_rng(0).integers(0, 256, (16, 64, 64, 3), np.uint8)
-    np.savez_compressed(tmp_path / "2022-9.npz", image=image[7:], reward=np.zeros(9))
-    np.savez(tmp_path / "2022-7.npz", image=np.asfortranarray(image[:7]))
-    script("import_videos").main([str(tmp_path), str(tmp_path / "episodes")])
-    window = Replay(tmp_path / "episodes").window(0, 16)
-    np.testing.assert_array_equal(window["image"], image)
-    assert np.flatnonzero(window["is_first"]).tolist() == [0, 7]
-    succeed("pretrain", "--videos", tmp_path / "episodes", "--runs", tmp_path, *DEBUG)
+VIDEO = np.repeat(np.arange(0, 240, 20, np.uint8), 96 * 128 * 3).reshape(12, 96, 128, 3)
+RGBA = np.concatenate([VIDEO, 255 - VIDEO[..., :1]], -1)
+ARRAYS = dict(plain=VIDEO, first=np.moveaxis(VIDEO, -1, 1), grey=VIDEO[..., 0], rgba=RGBA,
+              floats=VIDEO / 255, single=VIDEO[..., :1], fortran=np.asfortranarray(VIDEO))
+
+
+@pytest.mark.parametrize("kind", [*ARRAYS, "film.mp4", "film.gif", "pictures", "chunk.npz"])
+def test_videos_are_imported_as_people_have_them(kind, tmp_path, capsys, monkeypatch):
+    """All become the same frames; one line says how. Where an episode begins is kept."""
+    source, first = tmp_path / "source", np.arange(12) % 8 == 3
+    source.mkdir()
+    if kind.startswith("film"):
+        iio.imwrite(source / kind, VIDEO, **dict(fps=25) if "mp4" in kind else {})
+    elif kind == "pictures":
+        (source / kind).mkdir()
+        for i, picture in enumerate(RGBA):
+            iio.imwrite(source / kind / f"frame_{i}.png", picture)  # 10 comes after 9
+    elif kind == "chunk.npz":
+        np.savez_compressed(source / kind, image=VIDEO, is_first=first, reward=np.zeros(12))
+    else:
+        np.save(source / "video.npy", ARRAYS[kind])
+    monkeypatch.setattr(script("import_videos"), "CHUNK", 5)
+    script("import_videos").main([str(source), str(tmp_path / "episodes")])
+    episodes = Replay(tmp_path / "episodes")
+    window = episodes.window(0, 12)
+    error = np.abs(window["image"].astype(int) - np.arange(0, 240, 20)[:, None, None, None])
+    assert error.max() <= (4 if "mp4" in kind else 0) and episodes.bounds == [0, 5, 10, 12]
+    begins = [0, 3, 11] if "npz" in kind else [0]
+    assert np.flatnonzero(window["is_first"]).tolist() == begins
+    says, total = capsys.readouterr().out.splitlines()
+    assert "12 frames of " in says and "by area" in says and total.endswith("1 videos")
+
+
+@pytest.mark.parametrize("crop", [False, True])
+def test_frames_are_resized_by_area_and_squeezed_or_cropped(crop):
+    """Each pixel is the mean of those that it covers; --crop takes the middle square."""
+    picture = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
+    area = (picture[:, 64:192] if crop else picture).reshape(64, 2, 64, -1, 3).mean((1, 3))
+    assert np.abs(script("import_videos").to_frame(picture, crop) - area).max() <= 1
+
+
+def test_a_long_video_is_never_in_memory_as_a_whole(tmp_path):
+    """Neither 50 000 imported frames, 614 MB, nor the 691 MB that are being imported."""
+    (tmp_path / "raw").mkdir()
+    for path, *kind in (("long.npy", diswm.VIDEO_ROW, (50_000,)),
+                        ("raw/large.npy", np.uint8, (1500, 480, 320, 3))):
+        np.lib.format.open_memmap(tmp_path / path, "w+", *kind).flush()
+    pretrain = ("diswm.py", "pretrain", "--videos", tmp_path, "--runs", tmp_path / "runs", *DEBUG)
+    for argv in pretrain, ("results/import_videos.py", tmp_path / "raw", tmp_path / "episodes"):
+        process = subprocess.Popen([sys.executable, *argv], cwd=README.parent)
+        _, status, usage = os.wait4(process.pid, 0)
+        assert status == 0 and usage.ru_maxrss < 1_000_000, argv  # kB, of which 500 MB are imports
 
 
 def test_what_is_no_video_is_refused(tmp_path):
     """One line names the file and what is wrong with it, also where the end is cut off."""
     path, argv = tmp_path / "bad.npz", [str(tmp_path), str(tmp_path / "episodes")]
-    for array, says in ((np.zeros((9, 64, 64, 3)), "float64"), (np.array([{}], object), "pickle"),
+    for array, says in ((np.full((9, 64, 64, 3), 2.0), "[2, 2]"),
+                        (np.array([{}], object), "pickle"),
                         (np.zeros((64, 64, 3), np.uint8), "(64, 64, 3)"),
                         (np.zeros((0, 64, 64, 3), np.uint8), "(0, 64"), (None, "not a zip")):
         np.savez(path, image=array)
