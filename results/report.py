@@ -1,0 +1,136 @@
+"""One page to look at a run: report.html, which opens without a network, and its moving pictures.
+
+The page has a slider for each latent of a β-VAE, and the picture decoded from it; traversal.png,
+open_loop.png, a film strip of the latest episode and the learning curve. film.png and traversal.mp4
+are files of their own, too.
+"""
+
+import base64
+import html
+import json
+from pathlib import Path
+
+import common
+import imageio.v3 as iio
+import numpy as np
+import plot
+import torch
+
+import diswm
+
+VALUES = np.linspace(-4, 4, 33)  # of a slider
+STYLE = """body { font: 16px/1.5 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em }
+img { max-width: 100%; image-rendering: pixelated }
+.latents { display: grid; grid-template-columns: repeat(auto-fill, minmax(190px, 1fr)); gap: 1em }
+.latents figure { margin: 0 } figcaption { font-size: 14px }
+.cell { width: 128px; height: 128px; image-rendering: pixelated; background-size: 3300% 100% }
+input { width: 128px }"""
+SCRIPT = """for (const slider of document.querySelectorAll("input")) {
+  const cell = slider.parentNode.querySelector(".cell");
+  const value = slider.parentNode.querySelector("output");
+  const show = () => {
+    cell.style.backgroundPositionX = 100 * slider.value / slider.max + "%";
+    value.textContent = (8 * slider.value / slider.max - 4).toFixed(2);
+  };
+  slider.addEventListener("input", show);
+  show();
+}"""
+
+
+def data_url(content, kind="image/png"):
+    """A file's bytes as an address that holds them."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+def encode_png(picture):
+    """uint8 (h, w, 3) → the bytes of a PNG"""
+    return iio.imwrite("<bytes>", picture, extension=".png")
+
+def encode_film(pictures, size=2):
+    """uint8 (T, h, w, 3) → the bytes of an mp4, enlarged"""
+    return iio.imwrite("<bytes>", pictures.repeat(size, 1).repeat(size, 2), extension=".mp4",
+                       fps=12, macro_block_size=1)
+
+def section(head, text, *content):
+    """A part of the page."""
+    return f"<h2>{head}</h2>\n<p>{text}</p>\n" + "\n".join(content)
+
+def image_tag(path):
+    return f'<img src="{data_url(path.read_bytes())}" alt="{path.stem}">'
+
+def video_tag(content):
+    return f'<video src="{data_url(content, "video/mp4")}" controls loop muted></video>'
+
+def latent_cells(pictures, nats, order):
+    """A slider for each latent: its decodings (V, 64, 64, 3) lie side by side in one PNG."""
+    last, cells = len(VALUES) - 1, []
+    for z in order:
+        strip = data_url(encode_png(np.concatenate(pictures[z], axis=1)))
+        cells.append(f'<figure><div class="cell" style="background-image: url({strip})"></div>'
+                     f'<input type="range" max="{last}" value="{last // 2}" aria-label="z{z}">'
+                     f"<figcaption>z{z} = <output></output>, {nats[z]:.2f} nats</figcaption>"
+                     "</figure>")
+    return '<div class="latents">' + "\n".join(cells) + "</div>"
+
+def learning_curve(run):
+    """Draw curve.png by results/plot.py → whether there was an evaluation to draw."""
+    if "eval_return" not in (run / "metrics.jsonl").read_text():
+        return False
+    plot.draw(plot.collect_figures([run]), run / "curve.png")
+    return True
+
+def film_strip(run, title):
+    """Draw film.png: twelve frames of the latest episode, labelled by their decision."""
+    replay = diswm.Replay(run / "episodes")
+    images = replay.read(replay.paths[-1])["image"]
+    shown = np.linspace(0, len(images) - 1, 12).astype(int)
+    diswm.draw_grid(images[shown][None], [""], shown, run / "film.png", title)
+
+def latent_sections(run, model, batch):
+    """What a β-VAE's latents do: sliders, a film of the first ten, traversal.png."""
+    pictures, nats = diswm.latent_traversal(model, batch, VALUES)
+    pictures, order = pictures[:, 1:], np.argsort(-nats)  # informative first
+    film = encode_film(np.concatenate(pictures[order[:10]], axis=2))
+    (run / "traversal.mp4").write_bytes(film)
+    return [section("Latents", "Each slider moves one latent and keeps the others. Nats: its KL to "
+                    "the prior; a latent of 0 nats knows nothing of the picture.",
+                    latent_cells(pictures, nats, order)),
+            section("Traversal", "A film of the ten latents with most nats, then all latents.",
+                    video_tag(film), image_tag(run / "traversal.png"))]
+
+def report(run):
+    """Write a run's report.html, film.png, traversal.mp4, curve.png."""
+    diswm.traverse(run)
+    cfg, model, saved = diswm.open_run(run / "checkpoint.pt")
+    model, done = getattr(model, "model", model), saved["done"]  # an agent's
+    step = f"{done['env_steps']:,} env steps" if done["env_steps"] else f"{done['updates']} updates"
+    pair = cfg.dst if cfg.src == cfg.dst else f"{cfg.src} → {cfg.dst}"
+    title = f"{pair}, {cfg.method}, seed {cfg.seed}, {saved['stage']}, {step}"
+    film_strip(run, title)
+    sections, batch = [], diswm.last_window(run, model)
+    if learning_curve(run):
+        sections.append(section("Learning curve", "", image_tag(run / "curve.png")))
+    torch.manual_seed(cfg.seed)
+    if cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
+        sections += latent_sections(run, model, batch)
+    frames = np.concatenate(diswm.open_loop(model, batch), axis=2)
+    sections.append(section("Open-loop prediction", "Truth, model, error. The model sees five "
+                            "frames, then only actions.", video_tag(encode_film(frames, 4)),
+                            image_tag(run / "open_loop.png")))
+    sections.append(section("Latest episode", "Labels count decisions.",
+                            image_tag(run / "film.png")))
+    config = html.escape(json.dumps(vars(saved["config"]), indent=1))
+    sections.append(section("Settings", "", f"<details><summary>config.json</summary><pre>{config}"
+                            "</pre></details>"))
+    page = (f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>'
+            f"<style>{STYLE}</style>\n<h1>{title}</h1>\n" + "\n".join(sections)
+            + f"\n<script>{SCRIPT}</script></html>\n")
+    (run / "report.html").write_text(page, encoding="utf-8")
+    print(f"wrote {run}/report.html ({len(page) / 1e6:.1f} MB), film.png, traversal.mp4, curve.png")
+
+def main(argv=None):
+    parser = diswm.Parser(description=__doc__.split("\n")[0])
+    parser.add_argument("run", type=Path, metavar="RUN", help="its folder: runs/…/seed0")
+    report(parser.parse_args(argv).run)
+
+if __name__ == "__main__":
+    common.run_script(main)
