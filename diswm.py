@@ -26,6 +26,7 @@ import contextlib
 import ctypes
 import difflib
 import fcntl
+import hashlib
 import inspect
 import io
 import json
@@ -55,6 +56,7 @@ try:
 except (AttributeError, ImportError) as error:  # how a missing libEGL or libOSMesa shows
     sys.exit(f"error: MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; run: bash run_all.sh test")
 
+VERSIONS = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
 log = logging.getLogger("diswm")  # only the command line prints
 
 class UserError(Exception):
@@ -73,6 +75,7 @@ class Config:
     dst: str = "walker_walk"  # target task (paper)
     method: str = "diswm"  # the paper's method, a baseline or an ablation (paper)
     seed: int = 0  # seed of everything random (ours)
+    tag: str = ""  # sets runs of other settings apart: folder <method>+<tag> (ours)
     runs: str = "runs"  # folder of all runs (ours)
     teacher: str = ""  # a teacher's checkpoint.pt; empty: the one for --src (ours)
     videos: str = ""  # folder of episodes, *.npy; empty: collect's (ours)
@@ -1068,9 +1071,10 @@ def prepare_machine(cfg):
 
 # === Runs: folders, checkpoints, logs ===
 def run_folder(cfg, stage):
-    """<runs>/<stage>/<tasks>/<method>/seed<k>: the same command finds its run again."""
+    """<runs>/<stage>/<tasks>/<method>[+<tag>]/seed<k>: the same command finds its run again."""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
-    return Path(cfg.runs) / stage / tasks.replace("/", "_") / cfg.method / f"seed{cfg.seed}"
+    parts = stage, tasks, f"{cfg.method}+{cfg.tag}" if cfg.tag else cfg.method, f"seed{cfg.seed}"
+    return Path(cfg.runs, *(part.replace("/", "_") for part in parts))
 
 def read_checkpoint(path):
     """A checkpoint, loaded without executing code. No path in it is followed."""
@@ -1084,8 +1088,8 @@ class Run:
     """A run's folder, which `start` makes. Colours, η and all seeds follow from the counts in
     `done`, so that no checkpoint needs a simulator or a random state."""
     def __init__(self, cfg, stage, fresh=False):
-        self.cfg, self.stage, self.fresh, self.log = cfg, stage, fresh, ""
-        self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0)
+        self.cfg, self.stage, self.fresh, self.log, self.inputs = cfg, stage, fresh, "", {}
+        self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0, seconds=0.0)
         self.folder = run_folder(cfg, stage)
         self.resumes = (self.folder / "checkpoint.pt").exists() and not fresh
         if self.resumes:
@@ -1096,13 +1100,13 @@ class Run:
                       if old[name] != new[name] and name not in MAY_CHANGE]
             if differ:
                 raise UserError(f"{self.folder} was started with {', '.join(differ)}; use the "
-                                "same flags, or --fresh to start over, or another --runs")
+                                "same flags, or --fresh to start over, or another --tag")
 
     def start(self, unit, total, **parts):
         """Make and lock the folder. parts (with a state_dict) go on from its checkpoint."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import
         self.unit, self.total, self.parts = unit, total, parts
-        begin = getattr(self.done, unit)
+        begin, self.before = getattr(self.done, unit), self.done.seconds
         self.folder.mkdir(parents=True, exist_ok=True)
         self.lock = open(self.folder / "lock", "w")  # noqa: SIM115  while the process lives
         try:
@@ -1119,6 +1123,11 @@ class Run:
             if "replay" in parts:
                 parts["replay"].load_state_dict(dict(episodes=0))
             self.save()
+        commit = os.popen(f"git -C '{Path(__file__).parent}' describe --always --dirty 2>&1").read()
+        row = dict(begin=begin, commit=commit.strip(), versions=VERSIONS, machine=list(os.uname()))
+        if begin < total:  # a line for each start
+            with open(self.folder / "provenance.jsonl", "a") as file:
+                file.write(json.dumps(row | dict(inputs=self.inputs)) + "\n")
         log.info("%s, at %s of %s %s, on %s with %s", self.folder, f"{begin:,}", f"{total:,}",
                  unit, self.cfg.device, self.cfg.precision)
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
@@ -1128,7 +1137,8 @@ class Run:
     def record(self, **row):
         """Log a row of metrics, and save a checkpoint."""
         done, seconds = getattr(self.done, self.unit), self.bar.format_dict["elapsed"]
-        row |= dict(seconds=seconds, rate=(done - self.bar.initial) / seconds)
+        self.done.seconds = self.before + seconds  # of all resumes
+        row |= dict(seconds=self.done.seconds, rate=(done - self.bar.initial) / seconds)
         self.log += json.dumps(row) + "\n"
         for name, value in row.items():
             if isinstance(value, (int, float)):
@@ -1287,7 +1297,7 @@ def finished_runs(folder):
     return [path for path in paths if read_checkpoint(path)["finished"]]
 
 def find_teacher(cfg):
-    """A video predictor to learn from: --teacher, or one of --src and --method."""
+    """A video predictor to learn from: --teacher, or one of --src and --method → (path, it)."""
     found = [cfg.teacher] if cfg.teacher else finished_runs(run_folder(cfg, "pretrain"))
     command = (f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method} "
                f"--seed {cfg.seed} --runs {cfg.runs}, with the same --preset")
@@ -1302,12 +1312,12 @@ def find_teacher(cfg):
         if getattr(own, name) != getattr(cfg, name):
             raise UserError(f"{path} does not fit; add {flag_name(name)} {getattr(own, name)}")
     log.info("teacher: %s", path)
-    return video
+    return path, video
 
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1)."""
     # Training's colours throughout. What only pretraining sets is left out.
-    cfg = replace(cfg, dst=cfg.src, method="dreamerv2", steps=cfg.collect_steps, switch=1.0,
+    cfg = replace(cfg, dst=cfg.src, method="dreamerv2", tag="", steps=cfg.collect_steps, switch=1.0,
                   pretrain_updates=1, z_dim=1, beta1=0.0, **METHODS["dreamerv2"])
     run = Run(cfg, "collect", fresh)
     with config_env(cfg, cfg.src) as env:
@@ -1322,7 +1332,7 @@ def pretrain(cfg, fresh=False):
     run = Run(cfg, "pretrain", fresh)
     folder = cfg.videos
     if not folder:
-        found = finished_runs(run_folder(replace(cfg, method="dreamerv2"), "collect"))
+        found = finished_runs(run_folder(replace(cfg, method="dreamerv2", tag=""), "collect"))
         folder = (found[0].parent if found else collect(cfg)) / "episodes"
     videos = Replay(folder)
     if videos.bounds[-1] < cfg.batch_length:
@@ -1340,7 +1350,9 @@ def finetune(cfg, fresh=False):
         raise UserError(f"source and target are both {cfg.src}; choose another --src")
     run, video = Run(cfg, "finetune", fresh), None
     if not run.resumes and (cfg.eta > 0 or cfg.carry_over != "none"):
-        video = find_teacher(cfg)
+        path, video = find_teacher(replace(cfg, tag=""))  # a tag's own: --teacher
+        digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        run.inputs = dict(teacher=str(path), sha256=digest)
     with config_env(cfg, cfg.dst) as env:
         torch.manual_seed(cfg.seed)  # of the weights
         agent = Agent(cfg, *env.action_space.shape)
@@ -1384,14 +1396,14 @@ def to_picture(image):
     return ((image.movedim(-3, -1) + 0.5).clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 @torch.no_grad()
-def latent_traversal(model, batch):
+def latent_traversal(model, batch, values=TRAVERSAL):
     """Vary one latent at a time (Fig. 5) in the first image of a window (1, T, ...) →
     uint8 (Z, 1 + values, 64, 64, 3), the reconstruction first; each latent's KL, nats, (Z,)."""
     out = model(batch)
     mean, logvar = out["code"]["mean"][0], out["code"]["logvar"][0]  # (T, Z)
     latents = torch.arange(mean.shape[1])
-    z = mean[0].repeat(len(latents), 1 + len(TRAVERSAL), 1)  # (Z, 1 + values, Z)
-    z[latents, 1:, latents] = z.new_tensor(TRAVERSAL)
+    z = mean[0].repeat(len(latents), 1 + len(values), 1)  # (Z, 1 + values, Z)
+    z[latents, 1:, latents] = z.new_tensor(values)
     deter = out["post"]["deter"][0, 0].expand(*z.shape[:2], -1)  # all else is in 𝐳
     feat = torch.cat([model.rssm.posterior(deter, z)["mean"], deter], -1)
     kl = beta_vae_kl(mean[..., None], logvar[..., None])  # (T, Z): of each
@@ -1413,45 +1425,49 @@ def open_loop(model, batch, context=5):
     return to_picture(torch.stack([truth, prediction, (prediction - truth) / 2]))
 
 def draw_grid(pictures, rows, columns, path, title=""):
-    """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
+    """pictures (rows, columns, 64, 64, 3) as one labelled PNG, twice as large, with gaps."""
     from matplotlib.figure import Figure  # slow to import
-    r, c = pictures.shape[:2]
-    axes = Figure(figsize=(c * 0.75 + 1, r * 0.75 + 0.5)).subplots()
-    axes.imshow(pictures.swapaxes(1, 2).reshape(r * 64, c * 64, 3))
-    axes.set(title=title, frame_on=False, yticks=np.arange(r) * 64 + 32, yticklabels=rows,
-             xticks=np.arange(c) * 64 + 32, xticklabels=columns)
+    pictures = np.pad(pictures, [(0, 0), (0, 0), (1, 1), (1, 1), (0, 0)], constant_values=255)
+    r, c, size = pictures.shape[:3]
+    axes = Figure(figsize=(c * size / 100, r * size / 100)).add_axes((0, 0, 1, 1))
+    axes.imshow(pictures.swapaxes(1, 2).reshape(r * size, c * size, 3), interpolation="nearest")
+    axes.set(title=title, frame_on=False, yticks=(np.arange(r) + 0.5) * size, yticklabels=rows,
+             xticks=(np.arange(c) + 0.5) * size, xticklabels=columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.figure.savefig(path, dpi=100, bbox_inches="tight")
+    axes.figure.savefig(path, dpi=200, bbox_inches="tight")
     log.info("wrote %s", path)
+
+def last_window(run, model):
+    """A batch of one window, mid-way in a run's last episode: not the first colours or pose."""
+    actions = model.rssm.action_dim
+    replay = Replay(run / "episodes", agent_row(actions) if actions else VIDEO_ROW)
+    if not replay.paths:
+        raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
+    rows = replay.read(replay.paths[-1])
+    rows = rows[len(rows) // 2:][:50]
+    batch = {name: np.array(rows[name])[None] for name in replay.dtype.names}
+    batch["is_first"][:, 0] = True
+    return to_device(batch, model.cfg.device)
 
 def traverse(run, **changes):
     """Draw a run's open_loop.png and, of a β-VAE, traversal.png, from its last episode."""
-    cfg, model, _ = open_run(run / "checkpoint.pt", **changes)
-    dtype = VIDEO_ROW
-    if isinstance(model, Agent):
-        dtype, model = agent_row(model.action_dim), model.model
-    replay = Replay(run / "episodes", dtype)
-    if not replay.paths:
-        raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
-    # From the middle of the last one: the colours of the end, not the first pose.
-    rows = replay.read(replay.paths[-1])
-    rows = rows[len(rows) // 2:][:50]
-    batch = to_device({name: np.array(rows[name])[None] for name in dtype.names}, cfg.device)
-    batch["is_first"][:, 0] = True
+    cfg, model, saved = open_run(run / "checkpoint.pt", **changes)
+    model, old, done = getattr(model, "model", model), saved["config"], saved["done"]
+    title = f"{old.dst}, {old.method}, seed {old.seed}, step {done['env_steps'] or done['updates']}"
+    batch = last_window(run, model)
     torch.manual_seed(cfg.seed)
-    strip = open_loop(model, batch)[:, ::4]
-    draw_grid(strip, ("truth", "model", "error"), range(0, 4 * strip.shape[1], 4),
-              run / "open_loop.png", "predicted, not seen: frames 5 …")
+    strip = open_loop(model, batch)[:, ::5]
+    columns = [f"{5 * i}\n{'unseen' if i else 'seen'}" for i in range(strip.shape[1])]
+    draw_grid(strip, ("truth", "model", "error"), columns, run / "open_loop.png", title)
     if cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
         pictures, nats = latent_traversal(model, batch)
         order = np.argsort(-nats)  # informative first
         labels = [f"z{i}  {nats[i]:.2f} nats" for i in order]
-        draw_grid(pictures[order], labels, ["recon.", *TRAVERSAL], run / "traversal.png")
+        draw_grid(pictures[order], labels, ["recon.", *TRAVERSAL], run / "traversal.png", title)
 
 def doctor(tasks=FAMILIES):
     """Render each phase of tasks into doctor.png (Fig. 3), and say what runs here."""
-    versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
-    log.info("%s, CUDA: %s", versions, torch.cuda.is_available())
+    log.info("%s, CUDA: %s", VERSIONS, torch.cuda.is_available())
     pictures = np.empty((len(tasks), len(PHASES), 64, 64, 3), np.uint8)
     for task, row in zip(tasks, pictures, strict=True):
         with make_env(task) as env:
@@ -1462,8 +1478,8 @@ def doctor(tasks=FAMILIES):
 COLLECT = "src seed runs collect_steps environment acting models behaviour machine "
 COMMANDS = dict(  # groups of Config's fields, and single ones, that are flags of each
     collect=COLLECT,
-    pretrain=COLLECT + "method videos pretrain_updates encoder z_dim beta1 beta2",
-    finetune="src dst method seed runs teacher steps switch environment acting models encoder "
+    pretrain=COLLECT + "method tag videos pretrain_updates encoder z_dim beta1 beta2",
+    finetune="src dst method tag seed runs teacher steps switch environment acting models encoder "
              "carry_over bonus z_dim beta distillation behaviour machine",
     evaluate="dst seed environment eval_episodes device threads",
     traverse="seed device threads", doctor="")

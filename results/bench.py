@@ -6,15 +6,14 @@ import sys
 import tempfile
 import timeit
 from dataclasses import replace
-from pathlib import Path
 
+import common
 import gymnasium as gym
 import mujoco
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import diswm  # noqa: E402
+import diswm
 
 
 def median_s(function, repeats):
@@ -100,7 +99,4 @@ def main(argv=None):
     print(json.dumps(result, indent=None if given["json"] else 2))
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (diswm.UserError, OSError) as error:
-        sys.exit("error: " + " ".join(str(error).split()))
+    common.run_script(main)

@@ -5,15 +5,14 @@ disentanglement.json and a labelled latent traversal, disentanglement.png, into 
 """
 
 import json
-import sys
 from pathlib import Path
 
+import common
 import mujoco
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import diswm  # noqa: E402
+import diswm
 
 
 def group_name(model, array, rows):
@@ -93,30 +92,18 @@ def encoder_at_start(saved, action_dim):
     torch.manual_seed(cfg.seed)
     return diswm.WorldModel(cfg, action_dim).encoder  # which an Agent makes first
 
-def last_window(run, dtype, device):
-    """A batch of one window, from the middle of the run's last episode."""
-    replay = diswm.Replay(run / "episodes", dtype)
-    if not replay.paths:
-        raise diswm.UserError(f"no episodes in {replay.folder}; nothing to draw from")
-    rows = replay.read(replay.paths[-1])
-    rows = rows[len(rows) // 2:][:50]
-    batch = {name: np.array(rows[name])[None] for name in dtype.names}
-    batch["is_first"][:, 0] = True
-    return diswm.to_device(batch, device)
-
 @torch.no_grad()
 def measure(run, frames=2000, **changes):
     """Score a run's encoders, write JSON and picture. changes: Config values, not the run's own."""
     cfg, model, saved = diswm.open_run(run / "checkpoint.pt", **changes)
-    teacher, action_dim, dtype = None, 0, diswm.VIDEO_ROW
+    teacher, action_dim = None, 0
     if isinstance(model, diswm.Agent):
         teacher, action_dim, model = model.teacher, model.action_dim, model.model
-        dtype = diswm.agent_row(action_dim)
     if cfg.encoder != "beta_vae" or hasattr(model.rssm, "below"):
         raise diswm.UserError(f"{run} has no β-VAE latents to measure")
     if frames < 8:
         raise diswm.UserError(f"{frames} frames are too few to measure anything")
-    batch = last_window(run, dtype, cfg.device)
+    batch = diswm.last_window(run, model)
     images, factors, names = labelled_frames(cfg, frames)
     encoders = dict(teacher=teacher, start=encoder_at_start(saved, action_dim), end=model.encoder)
     result = dict(task=cfg.dst, factors=names)
@@ -147,7 +134,4 @@ def main(argv=None):
     measure(**{name: value for name, value in args.items() if value is not None})
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (diswm.UserError, OSError) as error:
-        sys.exit("error: " + " ".join(str(error).split()))
+    common.run_script(main)

@@ -4,13 +4,12 @@ A video is an .npz with an array `image`, uint8 (T, 64, 64, 3), like the authors
 """
 
 import io
-import sys
 from pathlib import Path
 
+import common
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import diswm  # noqa: E402
+import diswm
 
 
 def read_video(path):
@@ -43,7 +42,4 @@ def main(argv=None):
     print(f"{args.target}: {import_videos(args.source, args.target)} videos")
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (diswm.UserError, OSError) as error:
-        sys.exit("error: " + " ".join(str(error).split()))
+    common.run_script(main)
