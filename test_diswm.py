@@ -5,11 +5,13 @@ Oracles are independent of `diswm.py`: torch.distributions, numpy loops, Monte C
 hand. A planted bug is put back into the production code, and the tests named with it must fail.
 """
 
+import base64
 import contextlib
 import copy
 import dataclasses
 import functools
 import gc
+import hashlib
 import inspect
 import io
 import itertools
@@ -1943,6 +1945,31 @@ def test_a_finished_run_continued_does_nothing(copied, tmp_path):
         "events.out", "open_loop.png", "traversal.png"}
 
 
+def test_a_runs_folder_says_where_it_came_from(finished, teacher):
+    """Of the one start: commit, versions, machine, the teacher and its checksum. Seconds grow."""
+    line, = (finished / "provenance.jsonl").read_text().splitlines()
+    origin = json.loads(line)
+    assert re.fullmatch(r"[0-9a-f]{7,}(-dirty)?|.*git.*", origin["commit"])
+    assert origin["versions"]["torch"] == torch.__version__
+    assert os.uname().release in origin["machine"]
+    assert origin["teacher"] == dict(path=str(teacher),
+                                     sha256=hashlib.sha256(teacher.read_bytes()).hexdigest())
+
+
+def test_a_tag_sets_a_run_apart_and_its_seconds_add_up_over_resumes(teacher, root):
+    """The plain method's teacher serves it. Other settings in the same folder would be refused."""
+    argv = ("finetune", "--runs", root / "runs", *DEBUG, "--eta", 0.3, "--tag", "eta=0.3")
+    interrupt(diswm.Run, "record", 3, argv)
+    run = root / "runs" / FINETUNED.replace("diswm", "diswm+eta=0.3")
+    cut = log_rows(run)[-1]["seconds"]
+    succeed(*argv)
+    seconds = [row["seconds"] for row in log_rows(run)]
+    assert seconds == sorted(seconds) and seconds[2] > cut
+    starts = [json.loads(line) for line in (run / "provenance.jsonl").read_text().splitlines()]
+    assert [start["begin"] for start in starts] == [0, 100]
+    assert starts[0]["teacher"]["path"] == str(teacher)
+
+
 def test_other_flags_are_refused_with_their_names(copied, tmp_path):
     """A resumed run must not silently change what it computes; where it runs may change."""
     before, argv = all_files(copied), ("finetune", "--runs", tmp_path, *DEBUG)
@@ -2120,7 +2147,7 @@ SHORT = {  # what each command or script is given on top, so that it takes secon
     "collect": (*DEBUG, "--collect-steps", 200), "finetune": (*DEBUG, "--steps", 300),
     "pretrain": (*DEBUG, "--collect-steps", 200, "--pretrain-updates", 20),
     "evaluate": ONE, "traverse": ONE, "bench": (*DEBUG, "--repeats", 1),
-    "disentanglement": ("--frames", 60)}
+    "disentanglement": ("--frames", 60), "sample_diversity": ("--clips", 8, "--length", 9)}
 
 
 def readme_commands():
@@ -2185,6 +2212,7 @@ def everything(run):
     state = torch.load(run / "checkpoint.pt")
     assert state.pop("log") == (run / "metrics.jsonl").read_text()
     config = state.pop("config").items()
+    assert state["done"].pop("seconds") > 0
     return state | dict(
         config={name: value for name, value in config if name not in diswm.MAY_CHANGE},
         rows=[{name: value for name, value in row.items() if name not in ("seconds", "rate")}
@@ -2561,17 +2589,21 @@ def test_any_command_line_is_understood_or_one_line(command, options):
 # === The laboratory: curves =======================================================================
 
 LABORATORY = Path(diswm.__file__).parent / "results"
+SCRIPTS = sorted(path.stem for path in LABORATORY.glob("*.py") if path.stem != "common")
 sys.path.append(str(LABORATORY))
 
 
-def test_every_script_has_help_and_a_mistake_is_one_line(monkeypatch):
-    """As the command line runs them; sys.exit(text) prints it and exits with 1."""
-    for name in ("plot", "bench", "disentanglement", "import_videos"):
-        for flags, says in (["--help"], "0"), (["nowhere"] * 2, "error: .*nowhere.*"):
+def test_every_script_has_help_and_a_mistake_is_one_line(monkeypatch, capsys):
+    """As the command line runs them; a wrong flag exits with 2."""
+    for name in SCRIPTS:
+        for flags, says, code in ((["--help"], "", 0), (["nowhere"] * 2, "nowhere|needs|requi", 1),
+                                  (["nowhere", "--none"], "--none|required", 2)):
             monkeypatch.setattr(sys, "argv", [name, *flags])
             with pytest.raises(SystemExit) as stop:
                 runpy.run_path(str(LABORATORY / f"{name}.py"), run_name="__main__")
-            assert re.fullmatch(says, str(stop.value))
+            err = capsys.readouterr().err or f"{stop.value}\n" * bool(code)  # sys.exit prints it
+            assert re.fullmatch(f"error: .*({says}).*\n" if code else "", err), err
+            assert stop.value.code in ((0,) if code == 0 else (1, 2, err.rstrip("\n")))
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5])
@@ -2586,11 +2618,15 @@ def test_interval_is_that_of_all_possible_resamples(count):
 
 
 def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
-    """area: trapezia by the steps that all seeds have; unequal gaps must count as such."""
+    """area: trapezia by the steps that all seeds have; unequal gaps must count as such. What the
+    longer seeds have alone is drawn, by its number of seeds, and counts for nothing."""
     figures = script("plot").curve_figures
-    runs = [{10: 0, 20: 10, 40: 20, 50: 60}, {10: 2, 20: 12, 30: 99, 50: 62, 40: 22}]
+    runs = [{10: 0, 20: 10, 40: 20, 50: 60}, {10: 2, 20: 12, 30: 99, 50: 62, 40: 22, 60: 7, 70: 8}]
     found = figures(runs, switch=25)
-    assert found["steps"] == [10, 20, 40, 50] and found["curve"][0] == [1, 11, 21, 61]
+    assert found["steps"] == [10, 20, 40, 50, 60, 70] and found["counts"] == [2, 2, 2, 2, 1, 1]
+    assert [mean for mean, *_ in found["curve"]] == [1, 11, 21, 61, 7, 8]
+    assert [len(point) for point in found["curve"]] == [3, 3, 3, 3, 1, 1]
+    assert found["final_step"] == 50
     assert found["area"][0] == pytest.approx((5 * 10 + 15 * 20 + 40 * 10) / 40 + 1)
     assert (found["final"][0], found["before"][0], found["after"][0]) == (31, 11, 21)
     assert figures(runs, switch=40)["before"][0] == 21  # evaluated in the old colours still
@@ -2612,15 +2648,96 @@ def test_plot_draws_the_published_figures_from_the_published_logs(tmp_path, monk
     runs = [*tmp_path.glob("*/*/seed0"), *sorted(LABORATORY.glob("*-*/*/seed*"))]
     script("plot").main([*map(str, runs), "--out", str(tmp_path)])
     found = json.loads((tmp_path / "curves.json").read_text())
-    assert found["a-Hopper-v5"]["diswm"]["steps"] == [20]
+    assert found["a → Hopper-v5"]["diswm"]["steps"] == [20]
     for pair in ("cheetah_run-walker_walk", "finger_spin-cartpole_swingup"):
-        published = json.loads((LABORATORY / f"{pair}.json").read_text())[pair]
-        for method, figures in found[pair].items():
+        panel = pair.replace("-", " → ")
+        published = json.loads((LABORATORY / f"{pair}.json").read_text())[panel]
+        for method, figures in found[panel].items():
             for name, value in figures.items():
-                np.testing.assert_allclose(published[method][name], value)
-    assert "cartpole_swingup: diswm, 3 seeds, final [127.3, 75.2, 156.8]" in capsys.readouterr().out
+                assert published[method][name] == json.loads(json.dumps(value))
+    assert ("cartpole_swingup: diswm, 3 seeds, at 100,000 env steps, final [127.3, 75.2, 156.8]"
+            in capsys.readouterr().out)
     assert panels["a → Hopper-v5"].get_ylim()[0] == 0 > panels["cheetah_run → pusher"].get_ylim()[0]
     assert iio.imread(tmp_path / "curves.png").std() > 10
+
+
+def write_log(folder, returns=(1, 2), success=(), **changes):
+    """A folder with the log and config.json of a run, evaluated every ten env steps."""
+    folder.mkdir(parents=True)
+    rows = [dict(step=10 * i, phase="train", eval_return=value) for i, value in
+            enumerate(returns, 1)]
+    rows += [dict(step=10 * i, phase="train", eval_success=value) for i, value in
+             enumerate(success, 1)]
+    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    config = dataclasses.asdict(tiny_config(**changes))
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def test_plot_pools_runs_of_equal_settings_only(tmp_path):
+    """Seeds and what a resumed run may change do not count. The bugs it kills: two values of η
+    drawn as two seeds of one method, and one run drawn as two seeds."""
+    collect = script("plot").collect_figures
+    first = write_log(tmp_path / "1", (1, 2), seed=0)
+    runs = [first, write_log(tmp_path / "2", (3, 4, 5), seed=1, runs="elsewhere", threads=2)]
+    figures = collect(runs)["cheetah_run → walker_walk"]["diswm"]
+    assert (figures["seeds"], figures["counts"]) == (2, [2, 2, 1])
+    with pytest.raises(UserError, match=r"3 are both diswm, but eta is 0.6 and 0.5; .*--tag"):
+        collect([first, write_log(tmp_path / "3", seed=2, eta=0.5)])
+    tagged = write_log(tmp_path / "4", seed=2, eta=0.5, tag="eta=0.5")
+    assert [*collect([first, tagged])["cheetah_run → walker_walk"]] == ["diswm", "diswm+eta=0.5"]
+    for twice in (first, first / "../1", shutil.copytree(first, tmp_path / "copy")):
+        with pytest.raises(UserError, match="are both seed0 of diswm"):
+            collect([first, twice])
+
+
+def test_plot_overlays_sources_draws_success_and_honours_the_suffix(tmp_path, capsys):
+    """Fig. 8 and Table B; a method without videos has one curve, whatever its source."""
+    plot = script("plot")
+    runs = [write_log(tmp_path / f"{src}/{method}", success=(0, 0.5), src=src, method=method)
+            for src, method in (("cheetah_run", "diswm"), ("finger_spin", "diswm"),
+                                ("finger_spin", "dreamerv2"))]
+    argv = [*map(str, runs), "--by", "src", "--metric", "eval_success", "--out"]
+    for suffix, begins in ("pdf", b"%PDF"), ("svg", b"<?xml"), ("png", b"\x89PNG"):
+        plot.main([*argv, str(tmp_path / f"c.{suffix}")])
+        assert (tmp_path / f"c.{suffix}").read_bytes().startswith(begins)
+    found = json.loads((tmp_path / "c.json").read_text())
+    curves = found["walker_walk"]
+    assert [*curves] == ["diswm from cheetah_run", "diswm from finger_spin", "dreamerv2"]
+    assert curves["dreamerv2"]["final"] == [0.25]
+    for flags, says in (["c.jpg"], "png, .pdf or .svg"), (["c.png", "--metric", "x"], "no x to"):
+        with pytest.raises(UserError, match=says):
+            plot.main([*argv, *flags])
+
+
+# === The laboratory: report, diversity of samples =================================================
+
+def test_report_is_one_file_without_links_whose_sliders_have_all_decodings(finished):
+    """It opens without a network. Each slider's strip holds its 33 values."""
+    script("report").main([str(finished)])
+    page = (finished / "report.html").read_text()
+    assert "Learning curve" in page
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)|https?://""", page)
+    strips = re.findall(r"url\(data:image/png;base64,([^)]*)\)", page)
+    shapes = {iio.imread(base64.b64decode(strip), extension=".png").shape for strip in strips}
+    assert len(strips) == page.count("<input") == 20 and shapes == {(64, 33 * 64, 3)}
+    check_picture(finished / "film.png")
+    assert len(iio.imread(finished / "traversal.mp4")) == 33
+
+
+def test_sample_diversity_is_the_distance_to_the_nearest_clip_of_another_episode(finished):
+    """By hand; and on real DMC, of clips that cross no seam."""
+    diversity = script("sample_diversity")
+    points, episodes = np.array([[0.0, 0], [0, 1], [3, 0], [3, 4]]), np.array([0, 0, 1, 1])
+    assert diversity.nearest_distance(points, points, episodes).tolist() == pytest.approx(
+        [3, 10**0.5, 3, 18**0.5])
+    assert diversity.nearest_distance(points[:1], points[2:]).tolist() == [3]
+    found = diversity.measure(finished, clips=8, length=9)
+    assert [*found] == ["videos", "replay", "replay to videos"]
+    assert all(0 < low <= mean <= high for mean, low, high in found.values())
+    check_picture(finished / "sample_diversity.png")
+    with pytest.raises(UserError, match="no two episodes of 999"):
+        diversity.measure(finished, length=999)
 
 
 # === The laboratory: disentanglement ==============================================================
