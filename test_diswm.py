@@ -2147,7 +2147,7 @@ SHORT = {  # what each command or script is given on top, so that it takes secon
     "collect": (*DEBUG, "--collect-steps", 200), "finetune": (*DEBUG, "--steps", 300),
     "pretrain": (*DEBUG, "--collect-steps", 200, "--pretrain-updates", 20),
     "evaluate": ONE, "traverse": ONE, "bench": (*DEBUG, "--repeats", 1),
-    "disentanglement": ("--frames", 60), "sample_diversity": ("--clips", 8, "--length", 9)}
+    "disentanglement": ("--frames", 60)}
 
 
 def readme_commands():
