@@ -207,7 +207,7 @@ def main(argv=None):
                         help=".png, .pdf or .svg to write; default: curves.png in --runs")
     args = parser.parse_args(argv)
     logs = sorted(args.runs.glob("finetune/*/*/seed*/metrics.jsonl"))
-    path = args.out or args.runs
+    path = args.out or args.runs / "curves.png"
     path = path / "curves.png" if path.is_dir() else path
     if path.suffix not in (".png", ".pdf", ".svg"):
         raise diswm.UsageError(f"--out {path}: give a name that ends in .png, .pdf or .svg")
