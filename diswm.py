@@ -26,7 +26,6 @@ import contextlib
 import ctypes
 import difflib
 import fcntl
-import hashlib
 import inspect
 import io
 import json
@@ -37,6 +36,7 @@ import re
 import shutil
 import sys
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -137,6 +137,7 @@ class Config:
     device: str = "auto"  # where it runs (ours)
     precision: str = "auto"  # of convolutions and MLPs; auto: bf16 where native (ours)
     threads: int = 0  # CPU threads; 0: one per core (ours)
+    wandb: str = ""  # project to log to as well, after: pip install wandb (ours)
 
     def __post_init__(self):
         """Raises UsageError at values that cannot be meant."""
@@ -152,7 +153,7 @@ LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
                carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
                device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
-MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads")  # of a run
+MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads", "wandb")  # of a run
 LOG_EVERY = 100  # updates of pretraining
 
 def flag_name(name):
@@ -1073,8 +1074,8 @@ def prepare_machine(cfg):
 def run_folder(cfg, stage):
     """<runs>/<stage>/<tasks>/<method>[+<tag>]/seed<k>: the same command finds its run again."""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
-    parts = stage, tasks, f"{cfg.method}+{cfg.tag}" if cfg.tag else cfg.method, f"seed{cfg.seed}"
-    return Path(cfg.runs, *(part.replace("/", "_") for part in parts))
+    method = f"{cfg.method}+{cfg.tag}".rstrip("+").replace("/", "_")
+    return Path(cfg.runs) / stage / tasks.replace("/", "_") / method / f"seed{cfg.seed}"
 
 def read_checkpoint(path):
     """A checkpoint, loaded without executing code. No path in it is followed."""
@@ -1105,7 +1106,7 @@ class Run:
     def start(self, unit, total, **parts):
         """Make and lock the folder. parts (with a state_dict) go on from its checkpoint."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import
-        self.unit, self.total, self.parts = unit, total, parts
+        self.unit, self.total, self.parts, self.shown = unit, total, parts, {}
         begin, self.before = getattr(self.done, unit), self.done.seconds
         self.folder.mkdir(parents=True, exist_ok=True)
         self.lock = open(self.folder / "lock", "w")  # noqa: SIM115  while the process lives
@@ -1123,15 +1124,18 @@ class Run:
             if "replay" in parts:
                 parts["replay"].load_state_dict(dict(episodes=0))
             self.save()
-        commit = os.popen(f"git -C '{Path(__file__).parent}' describe --always --dirty 2>&1").read()
-        row = dict(begin=begin, commit=commit.strip(), versions=VERSIONS, machine=list(os.uname()))
         if begin < total:  # a line for each start
+            git = os.popen(f"git -C '{Path(__file__).parent}' describe --always --dirty 2>&1")
+            row = dict(begin=begin, commit=git.read().strip(), machine=os.uname(), **VERSIONS)
             with open(self.folder / "provenance.jsonl", "a") as file:
-                file.write(json.dumps(row | dict(inputs=self.inputs)) + "\n")
-        log.info("%s, at %s of %s %s, on %s with %s", self.folder, f"{begin:,}", f"{total:,}",
-                 unit, self.cfg.device, self.cfg.precision)
+                file.write(json.dumps(row | self.inputs) + "\n")
+        where = f"{begin:,} of {total:,} {unit}, on {self.cfg.device} with {self.cfg.precision}"
+        log.info("%s, at %s", self.folder, where)
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
+        if self.cfg.wandb:
+            import wandb
+            wandb.init(project=self.cfg.wandb, config=vars(self.cfg), sync_tensorboard=True)
         self.writer = SummaryWriter(self.folder, purge_step=begin + 1, flush_secs=5)
 
     def record(self, **row):
@@ -1145,8 +1149,8 @@ class Run:
                 self.writer.add_scalar(name, value, done)
         self.save()
         shown = ("train_return", "eval_return", "image", "reward", "kl", "disentangle", "eta")
-        shown = "  ".join(f"{name} {row[name]:.4g}" for name in shown if name in row)
-        self.bar.set_postfix_str(shown, refresh=False)
+        self.shown |= {name: row[name] for name in shown if name in row}  # eval_return stays
+        self.bar.set_postfix(self.shown, refresh=False)
         self.bar.update(done - self.bar.n)
         if not sys.stderr.isatty():
             log.info("%s", self.bar)
@@ -1155,9 +1159,8 @@ class Run:
         """Write config and log, for people, and the checkpoint, which holds them too."""
         config, file = vars(self.cfg), io.BytesIO()  # a full disk is the file's error
         state = {name: part.state_dict() for name, part in self.parts.items()}
-        finished = getattr(self.done, self.unit) >= self.total
-        torch.save(dict(config=config, stage=self.stage, log=self.log, done=vars(self.done),
-                        finished=finished) | state, file)
+        state |= dict(config=config, stage=self.stage, log=self.log, done=vars(self.done))
+        torch.save(state | dict(finished=getattr(self.done, self.unit) >= self.total), file)
         write_whole(self.folder / "config.json", json.dumps(config, indent=2).encode())
         write_whole(self.folder / "metrics.jsonl", self.log.encode())
         write_whole(self.folder / "checkpoint.pt", file.getbuffer())
@@ -1250,6 +1253,8 @@ def train_agent(cfg, run, env, agent):
             result, _ = evaluate_agent(cfg, env, agent, phase)
             row |= {f"eval_{name}": value for name, value in result.items()}
             row["eval_step"] = due if due > began else cfg.steps
+            for name, pictures, *_ in picture_grids(run.folder, agent.model):
+                run.writer.add_image(name, join(pictures), done.env_steps, dataformats="HWC")
         run.record(**row)
 
 def evaluate_agent(cfg, env, agent, phase, explore=False):
@@ -1259,7 +1264,7 @@ def evaluate_agent(cfg, env, agent, phase, explore=False):
     phase = "eval" if family(cfg.dst) == "drawer" else phase
     torch.manual_seed(cfg.seed)
     returns, successes = [], []
-    for index in range(cfg.eval_episodes):
+    for index in tqdm(range(cfg.eval_episodes), "evaluation", leave=False, disable=None):
         episode, state = Episode(env, derived_seed(cfg.seed, "evaluate", index), phase), None
         while not episode.over:
             action = episode.random_action()
@@ -1282,12 +1287,11 @@ def open_run(path, **changes):
     cfg = prepare_machine(replace(saved["config"], **changes))
     with reading(path, "checkpoint of ours"):
         if saved["stage"] == "pretrain":
-            model = VideoPredictor(cfg).to(cfg.device)
-            model.load_state_dict(saved["model"])
+            model, name = VideoPredictor(cfg).to(cfg.device), "model"
         else:
             *_, last_bias = (value for name, value in saved["agent"].items() if ".actor." in name)
-            model = Agent(cfg, len(last_bias) // 2)  # a mean and a std for each action
-            model.load_state_dict(saved["agent"])
+            model, name = Agent(cfg, len(last_bias) // 2), "agent"  # mean and std of each action
+        model.load_state_dict(saved[name])
     return cfg, model, saved
 
 def finished_runs(folder):
@@ -1297,13 +1301,12 @@ def finished_runs(folder):
     return [path for path in paths if read_checkpoint(path)["finished"]]
 
 def find_teacher(cfg):
-    """A video predictor to learn from: --teacher, or one of --src and --method → (path, it)."""
-    found = [cfg.teacher] if cfg.teacher else finished_runs(run_folder(cfg, "pretrain"))
+    """A video predictor to learn from: --teacher, or one of --src and --method."""
+    path = cfg.teacher or next(iter(finished_runs(run_folder(cfg, "pretrain"))), None)
     command = (f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method} "
                f"--seed {cfg.seed} --runs {cfg.runs}, with the same --preset")
-    if not found:
+    if not path:
         raise UserError(f"no teacher of {cfg.src} in {cfg.runs}; {command}")
-    path = found[0]
     own, video, saved = open_run(path, device=cfg.device, threads=cfg.threads)
     if saved["stage"] != "pretrain" or not saved["finished"]:
         raise UserError(f"{path} is no finished pretraining; {command}")
@@ -1316,9 +1319,9 @@ def find_teacher(cfg):
 
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1)."""
-    # Training's colours throughout. What only pretraining sets is left out.
-    cfg = replace(cfg, dst=cfg.src, method="dreamerv2", tag="", steps=cfg.collect_steps, switch=1.0,
-                  pretrain_updates=1, z_dim=1, beta1=0.0, **METHODS["dreamerv2"])
+    cfg = replace(cfg, dst=cfg.src, steps=cfg.collect_steps, switch=1.0,  # the first colours
+                  method="dreamerv2", **METHODS["dreamerv2"],
+                  pretrain_updates=1, z_dim=1, beta1=0.0, tag="")  # only of pretraining
     run = Run(cfg, "collect", fresh)
     with config_env(cfg, cfg.src) as env:
         torch.manual_seed(cfg.seed)  # of the weights
@@ -1351,8 +1354,7 @@ def finetune(cfg, fresh=False):
     run, video = Run(cfg, "finetune", fresh), None
     if not run.resumes and (cfg.eta > 0 or cfg.carry_over != "none"):
         path, video = find_teacher(replace(cfg, tag=""))  # a tag's own: --teacher
-        digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-        run.inputs = dict(teacher=str(path), sha256=digest)
+        run.inputs = dict(teacher=str(path), sha256=sha256(Path(path).read_bytes()).hexdigest())
     with config_env(cfg, cfg.dst) as env:
         torch.manual_seed(cfg.seed)  # of the weights
         agent = Agent(cfg, *env.action_space.shape)
@@ -1377,15 +1379,14 @@ def evaluate(run, **changes):
         sampled, _ = evaluate_agent(cfg, env, agent, phase, explore=True)
         random, _ = evaluate_agent(cfg, env, None, phase)
     log.info("%s, %s colours", cfg.dst, result["phase"])
-    for name, played in (("mode", result), ("samples", sampled), ("random", random)):
-        log.info("%s: return %.1f ± %.1f", name, played["return"], played["std"])
-    result |= {f"sampled_{name}": value for name, value in sampled.items()}
-    result |= {f"random_{name}": value for name, value in random.items()}
-    result |= dict(task=cfg.dst, step=step)
+    found = dict(task=cfg.dst, step=step)
+    for prefix, played in (("", result), ("sampled_", sampled), ("random_", random)):
+        log.info("%sreturn %.1f ± %.1f", prefix, played["return"], played["std"])
+        found |= {prefix + name: value for name, value in played.items()}
     frames = np.stack([row["image"] for row in episode.rows]).repeat(4, 1).repeat(4, 2)
     iio.imwrite(run / "evaluation.mp4", frames, fps=25)  # 256 × 256
-    (run / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
-    return result
+    (run / "evaluation.json").write_text(json.dumps(found, indent=2) + "\n")
+    return found
 
 # === Figures: traverse and doctor ===
 TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
@@ -1411,8 +1412,7 @@ def latent_traversal(model, batch, values=TRAVERSAL):
 
 @torch.no_grad()
 def open_loop(model, batch, context=5):
-    """Filter `context` images of a window (1, T, ...), predict the others from its actions.
-    Returns uint8 (3, T, 64, 64, 3): truth, model, error."""
+    """From `context` images and all actions of a window → truth, model, error (3, T, 64, 64, 3)"""
     out = model({name: value[:, :context] for name, value in batch.items()})
     state = {name: value[:, -1] for name, value in out["post"].items()}
     feats = [out["feat"]]
@@ -1424,21 +1424,26 @@ def open_loop(model, batch, context=5):
     prediction = model.decoder(torch.cat(feats, 1))[0].clamp(-0.5, 0.5)
     return to_picture(torch.stack([truth, prediction, (prediction - truth) / 2]))
 
-def draw_grid(pictures, rows, columns, path, title=""):
-    """pictures (rows, columns, 64, 64, 3) as one labelled PNG, twice as large, with gaps."""
-    from matplotlib.figure import Figure  # slow to import
+def join(pictures):
+    """(rows, columns, h, w, 3) → one picture, with thin gaps"""
     pictures = np.pad(pictures, [(0, 0), (0, 0), (1, 1), (1, 1), (0, 0)], constant_values=255)
-    r, c, size = pictures.shape[:3]
-    axes = Figure(figsize=(c * size / 100, r * size / 100)).add_axes((0, 0, 1, 1))
-    axes.imshow(pictures.swapaxes(1, 2).reshape(r * size, c * size, 3), interpolation="nearest")
-    axes.set(title=title, frame_on=False, yticks=(np.arange(r) + 0.5) * size, yticklabels=rows,
-             xticks=(np.arange(c) + 0.5) * size, xticklabels=columns)
+    return np.concatenate(np.concatenate(pictures, 1), 1)
+
+def draw_grid(pictures, rows, columns, path, title=""):
+    """pictures (rows, columns, 64, 64, 3) as one labelled PNG, twice as large."""
+    from matplotlib.figure import Figure  # slow to import
+    picture = join(pictures)
+    axes = Figure(figsize=np.array(picture.shape[1::-1]) / 100).add_axes((0, 0, 1, 1))
+    axes.imshow(picture, interpolation="nearest")
+    axes.set(title=title, frame_on=False)
+    axes.set_yticks(range(33, len(picture), 66), rows)
+    axes.set_xticks(range(33, picture.shape[1], 66), columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     axes.figure.savefig(path, dpi=200, bbox_inches="tight")
     log.info("wrote %s", path)
 
 def last_window(run, model):
-    """A batch of one window, mid-way in a run's last episode: not the first colours or pose."""
+    """A batch of one window, mid-way in a run's last episode: not its first pose."""
     actions = model.rssm.action_dim
     replay = Replay(run / "episodes", agent_row(actions) if actions else VIDEO_ROW)
     if not replay.paths:
@@ -1449,21 +1454,26 @@ def last_window(run, model):
     batch["is_first"][:, 0] = True
     return to_device(batch, model.cfg.device)
 
-def traverse(run, **changes):
-    """Draw a run's open_loop.png and, of a β-VAE, traversal.png, from its last episode."""
-    cfg, model, saved = open_run(run / "checkpoint.pt", **changes)
-    model, old, done = getattr(model, "model", model), saved["config"], saved["done"]
-    title = f"{old.dst}, {old.method}, seed {old.seed}, step {done['env_steps'] or done['updates']}"
+def picture_grids(run, model):
+    """What traverse draws: name, pictures, names of rows, of columns."""
     batch = last_window(run, model)
-    torch.manual_seed(cfg.seed)
     strip = open_loop(model, batch)[:, ::5]
-    columns = [f"{5 * i}\n{'unseen' if i else 'seen'}" for i in range(strip.shape[1])]
-    draw_grid(strip, ("truth", "model", "error"), columns, run / "open_loop.png", title)
-    if cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
+    columns = ["0\\nseen", "5\\npredicted", *range(10, 50, 5)][:strip.shape[1]]
+    yield "open_loop", strip, ("truth", "model", "error"), columns
+    if model.cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
         pictures, nats = latent_traversal(model, batch)
         order = np.argsort(-nats)  # informative first
         labels = [f"z{i}  {nats[i]:.2f} nats" for i in order]
-        draw_grid(pictures[order], labels, ["recon.", *TRAVERSAL], run / "traversal.png", title)
+        yield "traversal", pictures[order], labels, ["recon.", *TRAVERSAL]
+
+def traverse(run, **changes):
+    """Draw a run's open_loop.png and, of a β-VAE, traversal.png, from its last episode."""
+    cfg, model, saved = open_run(run / "checkpoint.pt", **changes)
+    title = run_folder(replace(saved["config"], runs=""), saved["stage"])
+    step = saved["done"]["env_steps"] or saved["done"]["updates"]
+    torch.manual_seed(cfg.seed)
+    for name, *grid in picture_grids(run, getattr(model, "model", model)):
+        draw_grid(*grid, run / f"{name}.png", f"{title}, step {step:,}")
 
 def doctor(tasks=FAMILIES):
     """Render each phase of tasks into doctor.png (Fig. 3), and say what runs here."""
@@ -1546,7 +1556,7 @@ def main(argv=None):
         return 0
     except UserError as error:
         message, code = str(error), 2 if isinstance(error, UsageError) else 1
-    except OSError as error:
+    except (ImportError, OSError) as error:
         message, code = f"{error}; mend that and run the same command again", 1
     except KeyboardInterrupt:
         message, code = "interrupted; the same command goes on from the last checkpoint", 130
