@@ -68,14 +68,14 @@ class UsageError(UserError):
 # === Config ===
 @dataclass(frozen=True)
 class Config:
-    """The comments are the flags' help. Values are of the paper's (table) or, by default, of the
-    published configuration. A *decision* is an action, held for `action_repeat` env steps."""
+    """The comments are the flags' help. Values are the paper's (table) or, unmarked, the published
+    configuration's. A *decision* is an action, held for `action_repeat` env steps."""
     # --- run: what, where it is kept, how long
     src: str = "cheetah_run"  # task of the distracting videos (paper)
     dst: str = "walker_walk"  # target task (paper)
     method: str = "diswm"  # the paper's method, a baseline or an ablation (paper)
     seed: int = 0  # seed of everything random (ours)
-    tag: str = ""  # sets runs of other settings apart: folder <method>+<tag> (ours)
+    tag: str = ""  # sets a run of other settings apart (ours)
     runs: str = "runs"  # folder of all runs (ours)
     teacher: str = ""  # a teacher's checkpoint.pt; empty: the one for --src (ours)
     videos: str = ""  # folder of episodes, *.npy; empty: collect's (ours)
@@ -153,8 +153,7 @@ LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
                carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
                device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
-MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads", "wandb")  # of a run
-LOG_EVERY = 100  # updates of pretraining
+MAY_CHANGE = ("runs", "teacher", "videos", "device", "precision", "threads", "wandb")
 
 def flag_name(name):
     """lambda_ → --lambda"""
@@ -1072,7 +1071,7 @@ def prepare_machine(cfg):
 
 # === Runs: folders, checkpoints, logs ===
 def run_folder(cfg, stage):
-    """<runs>/<stage>/<tasks>/<method>[+<tag>]/seed<k>: the same command finds its run again."""
+    """<runs>/<stage>/<tasks>/<method>[+<tag>]/seed<k>"""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
     method = f"{cfg.method}+{cfg.tag}".rstrip("+").replace("/", "_")
     return Path(cfg.runs) / stage / tasks.replace("/", "_") / method / f"seed{cfg.seed}"
@@ -1086,8 +1085,7 @@ def read_checkpoint(path):
         return dict(saved, config=Config(**saved["config"]), log=str(saved["log"]))
 
 class Run:
-    """A run's folder, which `start` makes. Colours, η and all seeds follow from the counts in
-    `done`, so that no checkpoint needs a simulator or a random state."""
+    """A run's folder. All seeds follow from the counts in `done`, not from a state."""
     def __init__(self, cfg, stage, fresh=False):
         self.cfg, self.stage, self.fresh, self.log, self.inputs = cfg, stage, fresh, "", {}
         self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0, seconds=0.0)
@@ -1118,24 +1116,24 @@ class Run:
             with reading(self.folder / "checkpoint.pt", "checkpoint of ours"):
                 for name, part in parts.items():
                     part.load_state_dict(self.saved[name])
-        else:  # what --fresh replaces goes late: a mistake in the command costs nothing
+        else:  # late, so that a mistake in the command costs nothing
             for path in set(self.folder.iterdir()) - {self.folder / "lock"}:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             if "replay" in parts:
                 parts["replay"].load_state_dict(dict(episodes=0))
             self.save()
         if begin < total:  # a line for each start
-            git = os.popen(f"git -C '{Path(__file__).parent}' describe --always --dirty 2>&1")
+            git = os.popen(f"git -C '{Path(__file__).parent}' describe --always --dirty")
             row = dict(begin=begin, commit=git.read().strip(), machine=os.uname(), **VERSIONS)
             with open(self.folder / "provenance.jsonl", "a") as file:
                 file.write(json.dumps(row | self.inputs) + "\n")
-        where = f"{begin:,} of {total:,} {unit}, on {self.cfg.device} with {self.cfg.precision}"
-        log.info("%s, at %s", self.folder, where)
+        log.info("%s: %d of %d %s, %s", self.folder, begin, total, unit, self.cfg.device)
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
         if self.cfg.wandb:
             import wandb
-            wandb.init(project=self.cfg.wandb, config=vars(self.cfg), sync_tensorboard=True)
+            wandb.init(project=self.cfg.wandb, config=vars(self.cfg),
+                       sync_tensorboard=True, reinit="finish_previous")
         self.writer = SummaryWriter(self.folder, purge_step=begin + 1, flush_secs=5)
 
     def record(self, **row):
@@ -1149,18 +1147,18 @@ class Run:
                 self.writer.add_scalar(name, value, done)
         self.save()
         shown = ("train_return", "eval_return", "image", "reward", "kl", "disentangle", "eta")
-        self.shown |= {name: row[name] for name in shown if name in row}  # eval_return stays
+        self.shown |= {name: row[name] for name in shown if name in row}
         self.bar.set_postfix(self.shown, refresh=False)
         self.bar.update(done - self.bar.n)
         if not sys.stderr.isatty():
             log.info("%s", self.bar)
 
     def save(self):
-        """Write config and log, for people, and the checkpoint, which holds them too."""
+        """Write the checkpoint and, for people, its config and log."""
         config, file = vars(self.cfg), io.BytesIO()  # a full disk is the file's error
         state = {name: part.state_dict() for name, part in self.parts.items()}
         state |= dict(config=config, stage=self.stage, log=self.log, done=vars(self.done))
-        torch.save(state | dict(finished=getattr(self.done, self.unit) >= self.total), file)
+        torch.save(state | dict(finished=state["done"][self.unit] >= self.total), file)
         write_whole(self.folder / "config.json", json.dumps(config, indent=2).encode())
         write_whole(self.folder / "metrics.jsonl", self.log.encode())
         write_whole(self.folder / "checkpoint.pt", file.getbuffer())
@@ -1184,20 +1182,18 @@ def train_video_predictor(cfg, run, videos):
     model, done, metrics = VideoPredictor(cfg).to(cfg.device), run.done, []
     optimizer = adam(model, cfg.model_lr)
     run.start("updates", cfg.pretrain_updates, model=model, optimizer=optimizer)
-    shown = Replay(run.folder / "episodes")
-    if not shown.paths:  # one video stays with the run, for `traverse`
-        shown.add(videos.read(videos.paths[-1]))
+    if not (run.folder / "episodes").exists():  # one video stays, for `traverse`
+        Replay(run.folder / "episodes").add(videos.read(videos.paths[-1]))
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
         torch.manual_seed(rng.integers(2**63))  # of all noise
-        batch = videos.sample(cfg.batch_size, cfg.batch_length, rng)  # 5
-        batch = to_device(batch, cfg.device)
+        batch = to_device(videos.sample(cfg.batch_size, cfg.batch_length, rng), cfg.device)  # 5
         with autocast(cfg):
             loss, terms = model.loss(model(batch), batch)  # 6, 7: Eq. (2)
         terms["model_grad_norm"] = descend(loss, optimizer, cfg.grad_clip)
         metrics.append(check_finite(terms))
         done.updates += 1
-        if done.updates % LOG_EVERY == 0 or done.updates == cfg.pretrain_updates:
+        if done.updates % 100 == 0 or done.updates == cfg.pretrain_updates:
             run.record(update=done.updates, **mean_metrics(metrics))
             metrics = []
 
@@ -1220,7 +1216,7 @@ def train_agent(cfg, run, env, agent):
         raise UserError(f"{run.folder} has episodes and no checkpoint; start over with --fresh")
     run.start("env_steps", cfg.steps, agent=agent, replay=replay, **agent.optimizers)
     while done.env_steps < cfg.steps:  # 10: while not converged
-        # 9: random episodes, until all that the first updates are to see is there.
+        # 9: random episodes, until the first updates have all that they need.
         learning = done.decisions >= cfg.prefill and replay.bounds[-1] >= cfg.batch_length
         phase, end = color_phase(cfg, done.env_steps)
         seed = derived_seed(cfg.seed, run.stage, done.episodes)
@@ -1290,7 +1286,7 @@ def open_run(path, **changes):
             model, name = VideoPredictor(cfg).to(cfg.device), "model"
         else:
             *_, last_bias = (value for name, value in saved["agent"].items() if ".actor." in name)
-            model, name = Agent(cfg, len(last_bias) // 2), "agent"  # mean and std of each action
+            model, name = Agent(cfg, len(last_bias) // 2), "agent"  # of means and stds
         model.load_state_dict(saved[name])
     return cfg, model, saved
 
@@ -1301,27 +1297,26 @@ def finished_runs(folder):
     return [path for path in paths if read_checkpoint(path)["finished"]]
 
 def find_teacher(cfg):
-    """A video predictor to learn from: --teacher, or one of --src and --method."""
-    path = cfg.teacher or next(iter(finished_runs(run_folder(cfg, "pretrain"))), None)
+    """--teacher, or one of --src and --method → (its path, its VideoPredictor)."""
+    found = [Path(cfg.teacher)] if cfg.teacher else finished_runs(run_folder(cfg, "pretrain"))
     command = (f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method} "
                f"--seed {cfg.seed} --runs {cfg.runs}, with the same --preset")
-    if not path:
+    if not found:
         raise UserError(f"no teacher of {cfg.src} in {cfg.runs}; {command}")
-    own, video, saved = open_run(path, device=cfg.device, threads=cfg.threads)
+    own, video, saved = open_run(found[0], device=cfg.device, threads=cfg.threads)
     if saved["stage"] != "pretrain" or not saved["finished"]:
-        raise UserError(f"{path} is no finished pretraining; {command}")
+        raise UserError(f"{found[0]} is no finished pretraining; {command}")
     sizes = () if cfg.carry_over == "none" else ("stoch", "deter", "hidden")
     for name in ("src", "encoder", "z_dim", "cnn_depth", *sizes):
         if getattr(own, name) != getattr(cfg, name):
-            raise UserError(f"{path} does not fit; add {flag_name(name)} {getattr(own, name)}")
-    log.info("teacher: %s", path)
-    return path, video
+            raise UserError(f"{found[0]} does not fit; add {flag_name(name)} {getattr(own, name)}")
+    log.info("teacher: %s", found[0])
+    return found[0], video
 
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1)."""
-    cfg = replace(cfg, dst=cfg.src, steps=cfg.collect_steps, switch=1.0,  # the first colours
-                  method="dreamerv2", **METHODS["dreamerv2"],
-                  pretrain_updates=1, z_dim=1, beta1=0.0, tag="")  # only of pretraining
+    cfg = replace(cfg, dst=cfg.src, tag="", steps=cfg.collect_steps, switch=1.0, z_dim=1, beta1=0.0,
+                  pretrain_updates=1, method="dreamerv2", **METHODS["dreamerv2"])
     run = Run(cfg, "collect", fresh)
     with config_env(cfg, cfg.src) as env:
         torch.manual_seed(cfg.seed)  # of the weights
@@ -1329,7 +1324,7 @@ def collect(cfg, fresh=False):
     return run.folder
 
 def pretrain(cfg, fresh=False):
-    """Train the β-VAE video predictor (stage 2; collects videos first if there are none)."""
+    """Train the video predictor (stage 2), on collect's videos or --videos."""
     check_task(cfg.src)
     cfg = replace(cfg, dst=cfg.src)
     run = Run(cfg, "pretrain", fresh)
@@ -1353,8 +1348,8 @@ def finetune(cfg, fresh=False):
         raise UserError(f"source and target are both {cfg.src}; choose another --src")
     run, video = Run(cfg, "finetune", fresh), None
     if not run.resumes and (cfg.eta > 0 or cfg.carry_over != "none"):
-        path, video = find_teacher(replace(cfg, tag=""))  # a tag's own: --teacher
-        run.inputs = dict(teacher=str(path), sha256=sha256(Path(path).read_bytes()).hexdigest())
+        path, video = find_teacher(replace(cfg, tag=""))
+        run.inputs = dict(teacher=str(path), sha256=sha256(path.read_bytes()).hexdigest())
     with config_env(cfg, cfg.dst) as env:
         torch.manual_seed(cfg.seed)  # of the weights
         agent = Agent(cfg, *env.action_space.shape)
@@ -1366,10 +1361,10 @@ def finetune(cfg, fresh=False):
     return run.folder
 
 def evaluate(run, **changes):
-    """Play a run's policy by mode and by samples, and a random one, to JSON and mp4 (stage 4)."""
+    """Play a run's policy, by mode and by samples, and a random one (stage 4)."""
     cfg, agent, saved = open_run(run / "checkpoint.pt", **changes)
     if not isinstance(agent, Agent):
-        raise UserError(f"{run} is a video predictor without a policy; give a finetune run")
+        raise UserError(f"{run} is without a policy; give a finetune run")
     step = saved["done"]["env_steps"]
     phase, _ = color_phase(cfg, min(step, cfg.steps - 1))  # as in training
     with config_env(cfg, cfg.dst) as env:
@@ -1398,8 +1393,8 @@ def to_picture(image):
 
 @torch.no_grad()
 def latent_traversal(model, batch, values=TRAVERSAL):
-    """Vary one latent at a time (Fig. 5) in the first image of a window (1, T, ...) →
-    uint8 (Z, 1 + values, 64, 64, 3), the reconstruction first; each latent's KL, nats, (Z,)."""
+    """Vary one latent at a time (Fig. 5) in a window's first image; informative ones first →
+    uint8 (Z, 1 + values, 64, 64, 3), the reconstruction first; names."""
     out = model(batch)
     mean, logvar = out["code"]["mean"][0], out["code"]["logvar"][0]  # (T, Z)
     latents = torch.arange(mean.shape[1])
@@ -1407,12 +1402,14 @@ def latent_traversal(model, batch, values=TRAVERSAL):
     z[latents, 1:, latents] = z.new_tensor(values)
     deter = out["post"]["deter"][0, 0].expand(*z.shape[:2], -1)  # all else is in 𝐳
     feat = torch.cat([model.rssm.posterior(deter, z)["mean"], deter], -1)
-    kl = beta_vae_kl(mean[..., None], logvar[..., None])  # (T, Z): of each
-    return to_picture(model.decoder(feat)), kl.mean(0).cpu().numpy()
+    nats = beta_vae_kl(mean[..., None], logvar[..., None]).mean(0)  # of each
+    order = nats.argsort(descending=True)
+    names = [f"z{i}  {nats[i]:.2f} nats" for i in order]
+    return to_picture(model.decoder(feat[order])), names
 
 @torch.no_grad()
 def open_loop(model, batch, context=5):
-    """From `context` images and all actions of a window → truth, model, error (3, T, 64, 64, 3)"""
+    """Truth, prediction from `context` images and all actions, error: (3, T, 64, 64, 3)"""
     out = model({name: value[:, :context] for name, value in batch.items()})
     state = {name: value[:, -1] for name, value in out["post"].items()}
     feats = [out["feat"]]
@@ -1430,44 +1427,35 @@ def join(pictures):
     return np.concatenate(np.concatenate(pictures, 1), 1)
 
 def draw_grid(pictures, rows, columns, path, title=""):
-    """pictures (rows, columns, 64, 64, 3) as one labelled PNG, twice as large."""
+    """pictures (rows, columns, 64, 64, 3) as a labelled PNG, at twice their size."""
     from matplotlib.figure import Figure  # slow to import
     picture = join(pictures)
-    axes = Figure(figsize=np.array(picture.shape[1::-1]) / 100).add_axes((0, 0, 1, 1))
+    size = picture.shape[1] / 100, len(picture) / 100
+    axes = Figure(figsize=size).add_axes((0, 0, 1, 1))
     axes.imshow(picture, interpolation="nearest")
-    axes.set(title=title, frame_on=False)
-    axes.set_yticks(range(33, len(picture), 66), rows)
-    axes.set_xticks(range(33, picture.shape[1], 66), columns)
+    axes.set(title=title, frame_on=False, yticks=range(33, len(picture), 66), yticklabels=rows,
+             xticks=range(33, picture.shape[1], 66), xticklabels=columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     axes.figure.savefig(path, dpi=200, bbox_inches="tight")
     log.info("wrote %s", path)
 
-def last_window(run, model):
-    """A batch of one window, mid-way in a run's last episode: not its first pose."""
+def picture_grids(run, model):
+    """Of a run's last episode: name, pictures, names of rows, of columns."""
     actions = model.rssm.action_dim
     replay = Replay(run / "episodes", agent_row(actions) if actions else VIDEO_ROW)
     if not replay.paths:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
-    rows = replay.read(replay.paths[-1])
-    rows = rows[len(rows) // 2:][:50]
+    rows = replay.read(replay.paths[-1])[:50]
     batch = {name: np.array(rows[name])[None] for name in replay.dtype.names}
-    batch["is_first"][:, 0] = True
-    return to_device(batch, model.cfg.device)
-
-def picture_grids(run, model):
-    """What traverse draws: name, pictures, names of rows, of columns."""
-    batch = last_window(run, model)
+    batch = to_device(batch, model.cfg.device)
     strip = open_loop(model, batch)[:, ::5]
-    columns = ["0\\nseen", "5\\npredicted", *range(10, 50, 5)][:strip.shape[1]]
+    columns = ["0\nseen", "5\npredicted", *range(10, 50, 5)][:strip.shape[1]]
     yield "open_loop", strip, ("truth", "model", "error"), columns
     if model.cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
-        pictures, nats = latent_traversal(model, batch)
-        order = np.argsort(-nats)  # informative first
-        labels = [f"z{i}  {nats[i]:.2f} nats" for i in order]
-        yield "traversal", pictures[order], labels, ["recon.", *TRAVERSAL]
+        yield "traversal", *latent_traversal(model, batch), ["recon.", *TRAVERSAL]
 
 def traverse(run, **changes):
-    """Draw a run's open_loop.png and, of a β-VAE, traversal.png, from its last episode."""
+    """Draw a run's open_loop.png and, of a β-VAE, traversal.png (Figs. 5, 6)."""
     cfg, model, saved = open_run(run / "checkpoint.pt", **changes)
     title = run_folder(replace(saved["config"], runs=""), saved["stage"])
     step = saved["done"]["env_steps"] or saved["done"]["updates"]
@@ -1476,7 +1464,7 @@ def traverse(run, **changes):
         draw_grid(*grid, run / f"{name}.png", f"{title}, step {step:,}")
 
 def doctor(tasks=FAMILIES):
-    """Render each phase of tasks into doctor.png (Fig. 3), and say what runs here."""
+    """Draw each phase of tasks (Fig. 3), doctor.png, and say what runs here."""
     log.info("%s, CUDA: %s", VERSIONS, torch.cuda.is_available())
     pictures = np.empty((len(tasks), len(PHASES), 64, 64, 3), np.uint8)
     for task, row in zip(tasks, pictures, strict=True):

@@ -103,7 +103,7 @@ def measure(run, frames=2000, **changes):
         raise diswm.UserError(f"{run} has no β-VAE latents to measure")
     if frames < 8:
         raise diswm.UserError(f"{frames} frames are too few to measure anything")
-    batch = diswm.last_window(run, model)
+    batch = common.last_window(run, model)
     images, factors, names = labelled_frames(cfg, frames)
     encoders = dict(teacher=teacher, start=encoder_at_start(saved, action_dim), end=model.encoder)
     result = dict(task=cfg.dst, factors=names)
@@ -116,12 +116,11 @@ def measure(run, frames=2000, **changes):
             result[name] = scores | dict(share=share.tolist())
             print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")
     (run / "disentanglement.json").write_text(json.dumps(result, indent=2) + "\n")
-    pictures, nats = diswm.latent_traversal(model, batch)
-    order = np.argsort(-nats)  # informative first
-    labels = [f"z{z}  {nats[z]:.2f} nats  {names[share[:, z].argmax()]} {share[:, z].max():.2f}"
-              for z in order]
-    diswm.draw_grid(pictures[order], labels, ["recon.", *diswm.TRAVERSAL],
-                    run / "disentanglement.png")
+    pictures, labels = diswm.latent_traversal(model, batch)
+    for row, label in enumerate(labels):  # z3  2.20 nats
+        explained = share[:, int(label.split()[0][1:])]
+        labels[row] += f"  {names[explained.argmax()]} {explained.max():.2f}"
+    diswm.draw_grid(pictures, labels, ["recon.", *diswm.TRAVERSAL], run / "disentanglement.png")
     print(f"wrote {run}/disentanglement.png and disentanglement.json")
 
 def main(argv=None):

@@ -60,14 +60,15 @@ def image_tag(path):
 def video_tag(content):
     return f'<video src="{data_url(content, "video/mp4")}" controls loop muted></video>'
 
-def latent_cells(pictures, nats, order):
+def latent_cells(pictures, labels):
     """A slider for each latent: its decodings (V, 64, 64, 3) lie side by side in one PNG."""
     last, cells = len(VALUES) - 1, []
-    for z in order:
-        strip = data_url(encode_png(np.concatenate(pictures[z], axis=1)))
+    for decoded, label in zip(pictures, labels, strict=True):
+        name, nats = label.split(maxsplit=1)  # z3  2.20 nats
+        strip = data_url(encode_png(np.concatenate(decoded, axis=1)))
         cells.append(f'<figure><div class="cell" style="background-image: url({strip})"></div>'
-                     f'<input type="range" max="{last}" value="{last // 2}" aria-label="z{z}">'
-                     f"<figcaption>z{z} = <output></output>, {nats[z]:.2f} nats</figcaption>"
+                     f'<input type="range" max="{last}" value="{last // 2}" aria-label="{name}">'
+                     f"<figcaption>{name} = <output></output>, {nats}</figcaption>"
                      "</figure>")
     return '<div class="latents">' + "\n".join(cells) + "</div>"
 
@@ -87,13 +88,13 @@ def film_strip(run, title):
 
 def latent_sections(run, model, batch):
     """What a β-VAE's latents do: sliders, a film of the first ten, traversal.png."""
-    pictures, nats = diswm.latent_traversal(model, batch, VALUES)
-    pictures, order = pictures[:, 1:], np.argsort(-nats)  # informative first
-    film = encode_film(np.concatenate(pictures[order[:10]], axis=2))
+    pictures, labels = diswm.latent_traversal(model, batch, VALUES)
+    pictures = pictures[:, 1:]  # without the reconstruction
+    film = encode_film(np.concatenate(pictures[:10], axis=2))
     (run / "traversal.mp4").write_bytes(film)
     return [section("Latents", "Each slider moves one latent and keeps the others. Nats: its KL to "
                     "the prior; a latent of 0 nats knows nothing of the picture.",
-                    latent_cells(pictures, nats, order)),
+                    latent_cells(pictures, labels)),
             section("Traversal", "A film of the ten latents with most nats, then all latents.",
                     video_tag(film), image_tag(run / "traversal.png"))]
 
@@ -106,7 +107,7 @@ def report(run):
     pair = cfg.dst if cfg.src == cfg.dst else f"{cfg.src} → {cfg.dst}"
     title = f"{pair}, {cfg.method}, seed {cfg.seed}, {saved['stage']}, {step}"
     film_strip(run, title)
-    sections, batch = [], diswm.last_window(run, model)
+    sections, batch = [], common.last_window(run, model)
     if learning_curve(run):
         sections.append(section("Learning curve", "", image_tag(run / "curve.png")))
     torch.manual_seed(cfg.seed)
