@@ -39,6 +39,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from hypothesis import HealthCheck, example, given, settings, stateful
 from hypothesis import strategies as st
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributions import (
     Categorical,
     Normal,
@@ -1930,6 +1931,9 @@ def test_pipeline_evaluates_and_draws(finished, teacher, root):
         check_picture(run / "open_loop.png")
         if run != collected:  # DreamerV2 has no latents
             check_picture(run / "traversal.png", low=500)
+    log = EventAccumulator(str(finished), size_guidance=dict(images=0)).Reload()
+    for name in ("open_loop", "traversal"):
+        assert [image.step for image in log.Images(name)] == [100, 200, 300]
 
 
 def test_a_finished_run_continued_does_nothing(copied, tmp_path):
@@ -1943,31 +1947,23 @@ def test_a_finished_run_continued_does_nothing(copied, tmp_path):
     assert {path: after[path] for path in before} == before
     assert {path.name.split(".tfevents")[0] for path in after.keys() - before.keys()} <= {
         "events.out", "open_loop.png", "traversal.png"}
+    origin, = map(json.loads, (copied / "provenance.jsonl").read_text().splitlines())
+    assert origin["sha256"] == hashlib.sha256(Path(origin["teacher"]).read_bytes()).hexdigest()
 
 
-def test_a_runs_folder_says_where_it_came_from(finished, teacher):
-    """Of the one start: commit, versions, machine, the teacher and its checksum. Seconds grow."""
-    line, = (finished / "provenance.jsonl").read_text().splitlines()
-    origin = json.loads(line)
-    assert re.fullmatch(r"[0-9a-f]{7,}(-dirty)?|.*git.*", origin["commit"])
-    assert origin["versions"]["torch"] == torch.__version__
-    assert os.uname().release in origin["machine"]
-    content = hashlib.sha256(hashlib.sha256(teacher.read_bytes()).digest()).hexdigest()
-    assert origin["inputs"] == dict(teacher=f"--teacher {teacher} of sha256 {content[:12]}")
-
-
-def test_a_tag_sets_a_run_apart_and_its_seconds_add_up_over_resumes(teacher, root):
-    """The plain method's teacher serves it. Other settings in the same folder would be refused."""
-    argv = ("finetune", "--runs", root / "runs", *DEBUG, "--eta", 0.3, "--tag", "eta=0.3")
-    interrupt(diswm.Run, "record", 3, argv)
-    run = root / "runs" / FINETUNED.replace("diswm", "diswm+eta=0.3")
-    cut = log_rows(run)[-1]["seconds"]
+def test_a_tagged_run_says_where_it_came_from_and_goes_to_wandb(teacher, root, monkeypatch):
+    """The plain method's teacher serves it. wandb is imported only then, before events."""
+    run, calls = root / "runs" / FINETUNED.replace("diswm", "diswm+x"), []
+    argv = ("finetune", "--runs", root / "runs", *DEBUG, "--tag", "x", "--steps", 50, "--wandb", 1)
+    monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
+    refuse(*argv, says="wandb")
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **given: calls.append(
+        (given["project"], given["sync_tensorboard"], list(run.glob("events*"))))))
     succeed(*argv)
-    seconds = [row["seconds"] for row in log_rows(run)]
-    assert seconds == sorted(seconds) and seconds[2] > cut
-    starts = [json.loads(line) for line in (run / "provenance.jsonl").read_text().splitlines()]
-    assert [start["begin"] for start in starts] == [0, 100]
-    assert str(teacher) in starts[0]["inputs"]["teacher"]
+    assert calls == [("1", True, [])]
+    _, origin = map(json.loads, (run / "provenance.jsonl").read_text().splitlines())
+    assert re.fullmatch(r"([0-9a-f]{7,}(-dirty)?)?", origin["commit"])  # "": no repository
+    assert origin["torch"] == torch.__version__ and os.uname().release in origin["machine"]
 
 
 def test_other_flags_are_refused_with_their_names(copied, tmp_path):
@@ -2147,7 +2143,7 @@ SHORT = {  # what each command or script is given on top, so that it takes secon
     "collect": (*DEBUG, "--collect-steps", 200), "finetune": (*DEBUG, "--steps", 300),
     "pretrain": (*DEBUG, "--collect-steps", 200, "--pretrain-updates", 20),
     "evaluate": ONE, "traverse": ONE, "bench": (*DEBUG, "--repeats", 1),
-    "disentanglement": ("--frames", 60)}
+    "disentanglement": ("--frames", 60), "sample_diversity": ("--clips", 8, "--length", 9)}
 
 
 def readme_commands():
@@ -2259,7 +2255,10 @@ def test_finetuning_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
     argv = cut_command(root, tmp_path, method)
     interrupt(owner, name, call, argv)
     succeed(*argv)
-    assert_identical(everything(next(tmp_path.rglob("seed0"))), uncut[method])
+    run, = tmp_path.rglob("seed0")
+    assert_identical(everything(run), uncut[method])
+    seconds, starts = [row["seconds"] for row in log_rows(run)], run / "provenance.jsonl"
+    assert seconds == sorted(seconds) and len(starts.read_text().splitlines()) == 2
 
 
 def pretrain_command(root, runs, updates=210):
@@ -2589,32 +2588,17 @@ def test_any_command_line_is_understood_or_one_line(command, options):
 # === The laboratory: curves =======================================================================
 
 LABORATORY = Path(diswm.__file__).parent / "results"
-SCRIPTS = sorted(path.stem for path in LABORATORY.glob("*.py") if path.stem != "common")
 sys.path.append(str(LABORATORY))
 
 
 def test_every_script_has_help_and_a_mistake_is_one_line(monkeypatch, capsys):
-    """As the command line runs them; a wrong flag exits with 2."""
-    for name in SCRIPTS:
-        for flags, says, code in ((["--help"], "", 0), (["nowhere"] * 2, "nowhere|needs|requi", 1),
-                                  (["nowhere", "--none"], "--none|required", 2)):
-            monkeypatch.setattr(sys, "argv", [name, *flags])
+    """As the command line runs them; sys.exit(text) prints it and exits with 1."""
+    for path in set(LABORATORY.glob("*.py")) - {LABORATORY / "common.py"}:
+        for flags, says in (["--help"], "0"), (["nowhere"] * 2, "[12]|error: .*nowhere.*"):
+            monkeypatch.setattr(sys, "argv", [path.name, *flags])
             with pytest.raises(SystemExit) as stop:
-                runpy.run_path(str(LABORATORY / f"{name}.py"), run_name="__main__")
-            err = capsys.readouterr().err or f"{stop.value}\n" * bool(code)  # sys.exit prints it
-            assert re.fullmatch(f"error: .*({says}).*\n" if code else "", err), err
-            assert stop.value.code in ((0,) if code == 0 else (1, 2, err.rstrip("\n")))
-
-
-@pytest.mark.parametrize("count", [2, 3, 4, 5])
-def test_interval_is_that_of_all_possible_resamples(count):
-    """Percentiles of the mean over seeds drawn with replacement, up to the bootstrap's noise."""
-    returns = np.random.default_rng(count).gamma(2, 50, count)
-    every = [np.mean(draw) for draw in itertools.product(returns, repeat=count)]
-    _, *interval = script("plot").curve_figures([{10: value} for value in returns])["final"]
-    for end, share in zip(interval, (2.5, 97.5), strict=True):
-        low, high = np.percentile(every, [share - 0.6, share + 0.6], method="inverted_cdf")
-        assert low - 1e-9 <= end <= high + 1e-9
+                runpy.run_path(str(path), run_name="__main__")
+            assert re.fullmatch(says, str(stop.value)) and capsys.readouterr().err.count("\n") < 2
 
 
 def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
@@ -2626,9 +2610,9 @@ def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
     assert found["steps"] == [10, 20, 40, 50, 60, 70] and found["counts"] == [2, 2, 2, 2, 1, 1]
     assert [mean for mean, *_ in found["curve"]] == [1, 11, 21, 61, 7, 8]
     assert [len(point) for point in found["curve"]] == [3, 3, 3, 3, 1, 1]
-    assert found["final_step"] == 50
+    assert found["final_step"] == 50 and found["final"] == [31, 30, 32]  # of two seeds, the range
     assert found["area"][0] == pytest.approx((5 * 10 + 15 * 20 + 40 * 10) / 40 + 1)
-    assert (found["final"][0], found["before"][0], found["after"][0]) == (31, 11, 21)
+    assert (found["before"][0], found["after"][0]) == (11, 21)
     assert figures(runs, switch=40)["before"][0] == 21  # evaluated in the old colours still
     assert "before" not in figures(runs) | figures(runs, switch=50)
     assert figures(runs[:1])["final"] == [30]  # no interval that nobody measured
@@ -2661,53 +2645,57 @@ def test_plot_draws_the_published_figures_from_the_published_logs(tmp_path, monk
     assert iio.imread(tmp_path / "curves.png").std() > 10
 
 
-def write_log(folder, returns=(1, 2), success=(), **changes):
+def write_log(folder, rows=2, **changes):
     """A folder with the log and config.json of a run, evaluated every ten env steps."""
     folder.mkdir(parents=True)
-    rows = [dict(step=10 * i, phase="train", eval_return=value) for i, value in
-            enumerate(returns, 1)]
-    rows += [dict(step=10 * i, phase="train", eval_success=value) for i, value in
-             enumerate(success, 1)]
+    rows = [dict(step=10 * i, phase="train", eval_success=i / 4) for i in range(1, rows + 1)]
     (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    config = dataclasses.asdict(tiny_config(**changes))
-    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "config.json").write_text(json.dumps(vars(tiny_config(**changes))))
     return folder
 
 
-def test_plot_pools_runs_of_equal_settings_only(tmp_path):
-    """Seeds and what a resumed run may change do not count. The bugs it kills: two values of η
-    drawn as two seeds of one method, and one run drawn as two seeds."""
-    collect = script("plot").collect_figures
-    first = write_log(tmp_path / "1", (1, 2), seed=0)
-    runs = [first, write_log(tmp_path / "2", (3, 4, 5), seed=1, runs="elsewhere", threads=2)]
-    figures = collect(runs)["cheetah_run → walker_walk"]["diswm"]
-    assert (figures["seeds"], figures["counts"]) == (2, [2, 2, 1])
-    with pytest.raises(UserError, match=r"3 are both diswm, but eta is 0.6 and 0.5; .*--tag"):
-        collect([first, write_log(tmp_path / "3", seed=2, eta=0.5)])
-    tagged = write_log(tmp_path / "4", seed=2, eta=0.5, tag="eta=0.5")
-    assert [*collect([first, tagged])["cheetah_run → walker_walk"]] == ["diswm", "diswm+eta=0.5"]
-    for twice in (first, first / "../1", shutil.copytree(first, tmp_path / "copy")):
-        with pytest.raises(UserError, match="are both seed0 of diswm"):
-            collect([first, twice])
-
-
-def test_plot_overlays_sources_draws_success_and_honours_the_suffix(tmp_path, capsys):
-    """Fig. 8 and Table B; a method without videos has one curve, whatever its source."""
-    plot = script("plot")
-    runs = [write_log(tmp_path / f"{src}/{method}", success=(0, 0.5), src=src, method=method)
-            for src, method in (("cheetah_run", "diswm"), ("finger_spin", "diswm"),
-                                ("finger_spin", "dreamerv2"))]
+def test_plot_pools_equal_settings_only_overlays_sources_and_honours_the_suffix(tmp_path):
+    """Fig. 8, Table B. The bugs it kills: two values of η, or one run twice, drawn as two seeds."""
+    plot, first = script("plot"), write_log(tmp_path / "1")
+    other = write_log(tmp_path / "2", seed=2, eta=0.5)
+    copy = Path(shutil.copytree(first, tmp_path / "3"))
+    for run, says in (other, "but eta is 0.6 and 0.5; .*--tag"), (copy, "are both seed0 of diswm"):
+        with pytest.raises(UserError, match=says):
+            plot.collect_figures([first, run], "eval_success")
+    runs = [first, write_log(tmp_path / "4", rows=3, seed=1, runs="elsewhere", threads=2)]
+    runs += [write_log(tmp_path / str(changes), **changes) for changes in (
+        dict(eta=0.5, tag="x"), dict(src="hopper_hop"), dict(src="hopper_hop", method="dreamerv2"))]
     argv = [*map(str, runs), "--by", "src", "--metric", "eval_success", "--out"]
     for suffix, begins in ("pdf", b"%PDF"), ("svg", b"<?xml"), ("png", b"\x89PNG"):
         plot.main([*argv, str(tmp_path / f"c.{suffix}")])
         assert (tmp_path / f"c.{suffix}").read_bytes().startswith(begins)
-    found = json.loads((tmp_path / "c.json").read_text())
-    curves = found["walker_walk"]
-    assert [*curves] == ["diswm from cheetah_run", "diswm from finger_spin", "dreamerv2"]
-    assert curves["dreamerv2"]["final"] == [0.25]
-    for flags, says in (["c.jpg"], "png, .pdf or .svg"), (["c.png", "--metric", "x"], "no x to"):
-        with pytest.raises(UserError, match=says):
-            plot.main([*argv, *flags])
+    curves = json.loads((tmp_path / "c.json").read_text())["walker_walk"]
+    assert [*curves] == ["diswm from cheetah_run", "diswm from hopper_hop",
+                         "diswm+x from cheetah_run", "dreamerv2"]
+    assert curves["diswm from cheetah_run"]["counts"] == [2, 2, 1]
+    with pytest.raises(UserError, match="png, .pdf or .svg"):
+        plot.main([*argv, "c.jpg"])
+
+
+def test_a_sweep_trains_each_value_apart_and_what_needs_no_videos_once(tmp_path):
+    """Of the real run_all.sh, with a Python that notes what it is asked."""
+    (tmp_path / ".venv/bin").mkdir(parents=True)
+    (tmp_path / ".venv/bin/python").write_text('#!/bin/bash\necho "$@" >>calls\n')
+    (tmp_path / ".venv/bin/python").chmod(0o755)
+    for name in ("run_all.sh", "requirements.txt"):
+        shutil.copy(README.with_name(name), tmp_path)
+    for variables in dict(SWEEP="eta=0.1 z_dim=5,9"), dict(
+            METHODS="dreamerv2 apv", PAIRS="cheetah_run:walker_walk finger_spin:walker_walk"):
+        subprocess.run(["bash", "run_all.sh"], cwd=tmp_path, env=os.environ | variables, check=True)
+    calls = (tmp_path / "calls").read_text()
+    teacher = "--teacher runs/tour/pretrain/cheetah_run/diswm+z_dim={}/seed0/checkpoint.pt"
+    assert re.findall(r"(finetune|pretrain) .*?--tag (\S+) (.*)", calls) == [
+        *[("pretrain", f"z_dim={z}", f"--z-dim {z}") for z in (5, 9)],
+        ("finetune", "eta=0.1", "--eta 0.1"),
+        *[("finetune", f"z_dim={z}", f"--z-dim {z} {teacher.format(z)}") for z in (5, 9)]]
+    assert re.findall(r"finetune .*--src (\w+) .*--method (dream\w+|apv)", calls) == [
+        ("cheetah_run", "dreamerv2"), ("cheetah_run", "apv"), ("finger_spin", "apv")]
+    assert re.findall(r"plot.py --by (\w+)", calls) == ["pair", "src"]
 
 
 # === The laboratory: report, diversity of samples =================================================
@@ -2716,37 +2704,18 @@ def test_report_is_one_file_without_links_whose_sliders_have_all_decodings(finis
     """It opens without a network. Each slider's strip holds its 33 values."""
     script("report").main([str(finished)])
     page = (finished / "report.html").read_text()
-    assert "Learning curve" in page
     assert not re.findall(r"""(?:src|href)=["'](?!data:)|https?://""", page)
     strips = re.findall(r"url\(data:image/png;base64,([^)]*)\)", page)
     shapes = {iio.imread(base64.b64decode(strip), extension=".png").shape for strip in strips}
     assert len(strips) == page.count("<input") == 20 and shapes == {(64, 33 * 64, 3)}
-    check_picture(finished / "film.png")
     assert len(iio.imread(finished / "traversal.mp4")) == 33
 
 
-def test_a_run_is_loaded_and_acts_in_five_lines(finished, teacher):
-    """As in an evaluation: to the end, inside the bounds. A video predictor has no policy."""
-    episode = script("act").play(finished)
-    assert len(episode.rows) == 26 and np.isfinite(episode.total)
-    assert 0 < max(np.abs(row["action"]).max() for row in episode.rows) < 1
-    with pytest.raises(UserError, match="without a policy"):
-        script("act").play(teacher.parent)
-
-
-def test_sample_diversity_is_the_distance_to_the_nearest_clip_of_another_episode(finished):
-    """By hand; and on real DMC, of clips that cross no seam."""
-    diversity = script("sample_diversity")
+def test_sample_diversity_is_the_distance_to_the_nearest_clip_of_another_episode():
+    """By hand. The README's command draws it."""
     points, episodes = np.array([[0.0, 0], [0, 1], [3, 0], [3, 4]]), np.array([0, 0, 1, 1])
-    assert diversity.nearest_distance(points, points, episodes).tolist() == pytest.approx(
-        [3, 10**0.5, 3, 18**0.5])
-    assert diversity.nearest_distance(points[:1], points[2:]).tolist() == [3]
-    found = diversity.measure(finished, clips=8, length=9)
-    assert [*found] == ["videos", "replay", "replay to videos"]
-    assert all(0 < low <= mean <= high for mean, low, high in found.values())
-    check_picture(finished / "sample_diversity.png")
-    with pytest.raises(UserError, match="no two episodes of 999"):
-        diversity.measure(finished, length=999)
+    distances = script("sample_diversity").nearest_distance(points, points, episodes)
+    assert distances.tolist() == pytest.approx([3, 10**0.5, 3, 18**0.5])
 
 
 # === The laboratory: disentanglement ==============================================================

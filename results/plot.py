@@ -30,7 +30,7 @@ def read_config(folder):
     if not path.exists():
         return None
     with diswm.reading(path, "config.json of ours", "name other runs"):
-        return vars(diswm.Config()) | dict(json.loads(path.read_text()))
+        return dict(tag="") | dict(json.loads(path.read_text()))
 
 def read_run(folder, metric="eval_return"):
     """A run's log and settings: its curve is {env step: value of the metric}, `switch` the step
@@ -60,8 +60,8 @@ def check_seeds(runs, where):
     label, known = runs[0].label, [run for run in runs if run.config]
     for run in known[1:]:
         for name, value in known[0].config.items():
-            other = run.config.get(name)
-            free = name in (*diswm.MAY_CHANGE, "seed", "tag", "src")  # src: `where` has it
+            other = run.config.get(name, value)  # a field that came later says nothing
+            free = name in (*diswm.MAY_CHANGE, "seed", "tag", "src", "note")  # src: `where` has it
             if value != other and not free:
                 raise diswm.UserError(
                     f"{known[0].folder} and {run.folder} are both {label}, but {name} is {value} "
