@@ -13,7 +13,8 @@ def play(run, seed=0):
     if not isinstance(agent, diswm.Agent):
         raise diswm.UserError(f"{run} is a video predictor without a policy; give a finetune run")
     with diswm.config_env(cfg, cfg.dst) as env:
-        episode, state = diswm.Episode(env, seed, "shifted"), None
+        phase, _ = diswm.color_phase(cfg, cfg.steps - 1)
+        episode, state = diswm.Episode(env, seed, phase), None
         while not episode.over:
             action, state = agent.act(episode.rows[-1], state, explore=False)
             episode.step(action)

@@ -12,6 +12,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import torch
+from tqdm import tqdm
 
 import diswm
 
@@ -77,7 +78,7 @@ def bench(cfg, repeats):
     with tempfile.TemporaryDirectory() as folder:
         result |= time_updates(cfg, agent, folder, max(1, repeats))
     result |= dict(params=count_parameters(agent), frame_ms={}, decision_ms={})
-    for task in diswm.FAMILIES:
+    for task in tqdm(diswm.FAMILIES, "simulators", leave=False, disable=None):
         result["frame_ms"][task], result["decision_ms"][task] = time_simulator(cfg, task)
     return result
 

@@ -11,6 +11,7 @@ import common
 import mujoco
 import numpy as np
 import torch
+from tqdm import tqdm
 
 import diswm
 
@@ -40,7 +41,7 @@ def labelled_frames(cfg, count):
         # One group white at a time, then none: what changes nothing does not show.
         *lit, dark = [paint(env, colors) for colors in np.eye(len(env.groups) + 1)[:, :-1]]
         shown = [index for index, image in enumerate(lit) if (image != dark).any()]
-        for index in range(count):
+        for index in tqdm(range(count), "frames", leave=False, disable=None):
             if index % 50 == 0 or any(over):  # 50 decisions of an episode
                 seed = diswm.derived_seed(cfg.seed, "evaluate", index)
                 env.reset(seed=seed, options=dict(phase="none"))
@@ -66,7 +67,7 @@ def disentanglement(codes, factors):
     from scipy.stats import entropy  # slow to import
     from sklearn.ensemble import GradientBoostingRegressor
     n, importance, r2, gaps = len(codes) * 3 // 4, [], [], []
-    for factor in factors.T:
+    for factor in tqdm(factors.T, "factors", leave=False, disable=None):
         trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
         importance.append(trees.feature_importances_ + 1e-12)
         r2.append(max(0.0, trees.score(codes[n:], factor[n:])))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import common
 import numpy as np
+from tqdm import tqdm
 
 import diswm
 
@@ -26,7 +27,7 @@ def import_videos(source, target):
     if not paths:
         raise diswm.UserError(f"there are no *.npz in {source}")
     target.mkdir(parents=True, exist_ok=True)
-    for path in paths:
+    for path in tqdm(paths, "videos", leave=False, disable=None):
         image, file = read_video(path), io.BytesIO()
         episode = np.zeros(len(image), diswm.VIDEO_ROW)
         episode["image"], episode["is_first"][0] = image, True

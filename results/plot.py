@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import common
 import numpy as np
+from tqdm import tqdm
 
 import diswm
 
@@ -120,7 +121,7 @@ def collect_figures(folders, metric="eval_return", by="pair"):
     if not panels:
         raise diswm.UserError(f"no {metric} to plot; run: python diswm.py finetune")
     result = {}
-    for panel, labels in panels.items():
+    for panel, labels in tqdm(panels.items(), "intervals", leave=False, disable=None):
         switch = max(run.switch or 0 for runs in labels.values() for run in runs) or None
         result[panel] = {}
         for label, runs in sorted(labels.items()):

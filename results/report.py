@@ -1,8 +1,8 @@
 """One page to look at a run: report.html, which opens without a network, and its moving pictures.
 
 The page has a slider for each latent of a β-VAE, and the picture decoded from it; traversal.png,
-open_loop.png, a film strip of the latest episode and the learning curve. film.png and traversal.mp4
-are files of their own, too.
+open_loop.png, a film strip of the latest episode and the learning curve. film.png, film.gif
+and traversal.mp4 are files of their own, too.
 """
 
 import base64
@@ -15,6 +15,7 @@ import imageio.v3 as iio
 import numpy as np
 import plot
 import torch
+from tqdm import tqdm
 
 import diswm
 
@@ -63,7 +64,8 @@ def video_tag(content):
 def latent_cells(pictures, labels):
     """A slider for each latent: its decodings (V, 64, 64, 3) lie side by side in one PNG."""
     last, cells = len(VALUES) - 1, []
-    for decoded, label in zip(pictures, labels, strict=True):
+    for decoded, label in zip(tqdm(pictures, "latents", leave=False, disable=None), labels,
+                              strict=True):
         name, nats = label.split(maxsplit=1)  # z3  2.20 nats
         strip = data_url(encode_png(np.concatenate(decoded, axis=1)))
         cells.append(f'<figure><div class="cell" style="background-image: url({strip})"></div>'
@@ -80,11 +82,14 @@ def learning_curve(run):
     return True
 
 def film_strip(run, title):
-    """Draw film.png: twelve frames of the latest episode, labelled by their decision."""
+    """Draw film.png, twelve frames of the latest episode, labelled by their decision, and
+    film.gif, its first 400 decisions."""
     replay = diswm.Replay(run / "episodes")
     images = replay.read(replay.paths[-1])["image"]
     shown = np.linspace(0, len(images) - 1, 12).astype(int)
     diswm.draw_grid(images[shown][None], [""], shown, run / "film.png", title)
+    large = images[:400:2].repeat(3, 1).repeat(3, 2)
+    iio.imwrite(run / "film.gif", large, duration=80, loop=0)  # ms a frame
 
 def latent_sections(run, model, batch):
     """What a β-VAE's latents do: sliders, a film of the first ten, traversal.png."""
@@ -99,7 +104,7 @@ def latent_sections(run, model, batch):
                     video_tag(film), image_tag(run / "traversal.png"))]
 
 def report(run):
-    """Write a run's report.html, film.png, traversal.mp4, curve.png."""
+    """Write a run's report.html, film.png, film.gif, traversal.mp4, curve.png."""
     diswm.traverse(run)
     cfg, model, saved = diswm.open_run(run / "checkpoint.pt")
     model, done = getattr(model, "model", model), saved["done"]  # an agent's
@@ -126,7 +131,8 @@ def report(run):
             f"<style>{STYLE}</style>\n<h1>{title}</h1>\n" + "\n".join(sections)
             + f"\n<script>{SCRIPT}</script></html>\n")
     (run / "report.html").write_text(page, encoding="utf-8")
-    print(f"wrote {run}/report.html ({len(page) / 1e6:.1f} MB), film.png, traversal.mp4, curve.png")
+    print(f"wrote {run}/report.html ({len(page) / 1e6:.1f} MB), film.png, film.gif, traversal.mp4, "
+          "curve.png")
 
 def main(argv=None):
     parser = diswm.Parser(description=__doc__.split("\n")[0])
