@@ -1931,9 +1931,9 @@ def test_pipeline_evaluates_and_draws(finished, teacher, root):
         check_picture(run / "open_loop.png")
         if run != collected:  # DreamerV2 has no latents
             check_picture(run / "traversal.png", low=500)
-    log = EventAccumulator(str(finished), size_guidance=dict(images=0)).Reload()
     for name in ("open_loop", "traversal"):
-        assert [image.step for image in log.Images(name)] == [100, 200, 300]
+        images = EventAccumulator(str(finished), dict(images=0)).Reload().Images(name)
+        assert [image.step for image in images] == [100, 200, 300]
 
 
 def test_a_finished_run_continued_does_nothing(copied, tmp_path):
@@ -2608,8 +2608,7 @@ def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
     runs = [{10: 0, 20: 10, 40: 20, 50: 60}, {10: 2, 20: 12, 30: 99, 50: 62, 40: 22, 60: 7, 70: 8}]
     found = figures(runs, switch=25)
     assert found["steps"] == [10, 20, 40, 50, 60, 70] and found["counts"] == [2, 2, 2, 2, 1, 1]
-    assert [mean for mean, *_ in found["curve"]] == [1, 11, 21, 61, 7, 8]
-    assert [len(point) for point in found["curve"]] == [3, 3, 3, 3, 1, 1]
+    assert found["curve"] == [[1, 0, 2], [11, 10, 12], [21, 20, 22], [61, 60, 62], [7], [8]]
     assert found["final_step"] == 50 and found["final"] == [31, 30, 32]  # of two seeds, the range
     assert found["area"][0] == pytest.approx((5 * 10 + 15 * 20 + 40 * 10) / 40 + 1)
     assert (found["before"][0], found["after"][0]) == (11, 21)
@@ -2646,10 +2645,10 @@ def test_plot_draws_the_published_figures_from_the_published_logs(tmp_path, monk
 
 
 def write_log(folder, rows=2, **changes):
-    """A folder with the log and config.json of a run, evaluated every ten env steps."""
+    """A folder with the log and config.json of a run."""
     folder.mkdir(parents=True)
-    rows = [dict(step=10 * i, phase="train", eval_success=i / 4) for i in range(1, rows + 1)]
-    (folder / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    log = [json.dumps(dict(step=i, phase="train", eval_success=i / 4)) for i in range(rows)]
+    (folder / "metrics.jsonl").write_text("\n".join(log))
     (folder / "config.json").write_text(json.dumps(vars(tiny_config(**changes))))
     return folder
 
@@ -2670,11 +2669,8 @@ def test_plot_pools_equal_settings_only_overlays_sources_and_honours_the_suffix(
         plot.main([*argv, str(tmp_path / f"c.{suffix}")])
         assert (tmp_path / f"c.{suffix}").read_bytes().startswith(begins)
     curves = json.loads((tmp_path / "c.json").read_text())["walker_walk"]
-    assert [*curves] == ["diswm from cheetah_run", "diswm from hopper_hop",
-                         "diswm+x from cheetah_run", "dreamerv2"]
+    assert curves.keys() > {"diswm from hopper_hop", "diswm+x from cheetah_run", "dreamerv2"}
     assert curves["diswm from cheetah_run"]["counts"] == [2, 2, 1]
-    with pytest.raises(UserError, match="png, .pdf or .svg"):
-        plot.main([*argv, "c.jpg"])
 
 
 def test_a_sweep_trains_each_value_apart_and_what_needs_no_videos_once(tmp_path):
@@ -2682,17 +2678,16 @@ def test_a_sweep_trains_each_value_apart_and_what_needs_no_videos_once(tmp_path)
     (tmp_path / ".venv/bin").mkdir(parents=True)
     (tmp_path / ".venv/bin/python").write_text('#!/bin/bash\necho "$@" >>calls\n')
     (tmp_path / ".venv/bin/python").chmod(0o755)
-    for name in ("run_all.sh", "requirements.txt"):
-        shutil.copy(README.with_name(name), tmp_path)
-    for variables in dict(SWEEP="eta=0.1 z_dim=5,9"), dict(
+    shutil.copy(README.with_name("run_all.sh"), tmp_path)
+    (tmp_path / "requirements.txt").write_text("torch==2")
+    for variables in dict(SWEEP="eta=1,.1 z_dim=5"), dict(
             METHODS="dreamerv2 apv", PAIRS="cheetah_run:walker_walk finger_spin:walker_walk"):
         subprocess.run(["bash", "run_all.sh"], cwd=tmp_path, env=os.environ | variables, check=True)
     calls = (tmp_path / "calls").read_text()
-    teacher = "--teacher runs/tour/pretrain/cheetah_run/diswm+z_dim={}/seed0/checkpoint.pt"
+    own = "--z-dim 5 --teacher runs/tour/pretrain/cheetah_run/diswm+z_dim=5/seed0/checkpoint.pt"
     assert re.findall(r"(finetune|pretrain) .*?--tag (\S+) (.*)", calls) == [
-        *[("pretrain", f"z_dim={z}", f"--z-dim {z}") for z in (5, 9)],
-        ("finetune", "eta=0.1", "--eta 0.1"),
-        *[("finetune", f"z_dim={z}", f"--z-dim {z} {teacher.format(z)}") for z in (5, 9)]]
+        ("pretrain", "z_dim=5", "--z-dim 5"), ("finetune", "eta=1", "--eta 1"),
+        ("finetune", "eta=.1", "--eta .1"), ("finetune", "z_dim=5", own)]
     assert re.findall(r"finetune .*--src (\w+) .*--method (dream\w+|apv)", calls) == [
         ("cheetah_run", "dreamerv2"), ("cheetah_run", "apv"), ("finger_spin", "apv")]
     assert re.findall(r"plot.py --by (\w+)", calls) == ["pair", "src"]
