@@ -86,9 +86,9 @@ class Config:
     # --- environment (section 4)
     action_repeat: int = 2  # env steps per decision
     time_limit: int = 0  # env steps per episode; 0: the task's own (ours)
-    colors: str = "published"  # boxes around fixed centres or the original colours (paper)
+    colors: str = "published"  # around fixed centres or the original colours (paper)
     color_range: float = 0.2  # half width of a box, RGB in 0..1
-    fast_render: bool = False  # no anti-aliasing, about twice as fast (ours)
+    fast_render: bool = False  # no anti-aliasing, twice as fast (ours)
     # --- acting, and how often to learn
     prefill: int = 2500  # decisions at random before learning
     first_updates: int = 100  # updates right after prefill
@@ -113,7 +113,7 @@ class Config:
     z_dim: int = 20  # size of the β-VAE latent (table)
     beta: float = 0.015  # β, weight of the disentanglement loss in Eq. (5) (table)
     beta1: float = 1.0  # β₁, weight of the action-free KL in Eq. (2) (table)
-    beta2: float = 0.015  # β₂, weight of the disentanglement loss in Eq. (2) (table)
+    beta2: float = 0.015  # β₂, the same in Eq. (2) (table)
     # --- distillation, Eq. (3); its clock counts all decisions
     eta: float = 0.1  # η at the start (table)
     eta_end: float = 0.01  # η at the end (paper, section 3.4)
@@ -140,7 +140,7 @@ class Config:
     wandb: str = ""  # project to log to as well, after: pip install wandb (ours)
 
     def __post_init__(self):
-        """Raises UsageError at values that cannot be meant."""
+        """Refuse values that cannot be meant."""
         for name, value in vars(self).items():
             if name in CHOICES and value not in CHOICES[name]:
                 raise UsageError(f"{flag_name(name)} {value}: not of {', '.join(CHOICES[name])}")
@@ -149,7 +149,7 @@ class Config:
                 raise UsageError(f"{flag_name(name)} {value}: not {low} or more")
 
 LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_delay=-1,
-              batch_length=2)  # else a whole number is at least 1, any other at least 0
+              batch_length=2)  # else 1 for a whole number, 0 for others
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
                carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
                device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
@@ -1102,7 +1102,7 @@ class Run:
                                 "same flags, or --fresh to start over, or another --tag")
 
     def start(self, unit, total, **parts):
-        """Make and lock the folder. parts (with a state_dict) go on from its checkpoint."""
+        """Lock the folder. parts (with a state_dict) go on from its checkpoint."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import
         self.unit, self.total, self.parts, self.shown = unit, total, parts, {}
         begin, self.before = getattr(self.done, unit), self.done.seconds
@@ -1198,7 +1198,7 @@ def train_video_predictor(cfg, run, videos):
             metrics = []
 
 def color_phase(cfg, env_steps):
-    """The phase of an episode that begins then, and the env step at which it must end."""
+    """An episode's phase, and the env step at which it must end."""
     switch = int(cfg.switch * cfg.steps)  # once, at the midpoint
     return ("train", switch) if env_steps < switch else ("shifted", cfg.steps)
 
@@ -1255,12 +1255,12 @@ def train_agent(cfg, run, env, agent):
 
 def evaluate_agent(cfg, env, agent, phase, explore=False):
     """Play episodes, the same seeds every time, with the actor's mode, explore: its samples or,
-    agent None, at random → dict of phase, return, std, returns, success; the last episode."""
+    agent None, at random → dict of phase, return, std, returns, success; an episode."""
     # DEVIATION: the paper does not say in which colours; here, training's or metal.
     phase = "eval" if family(cfg.dst) == "drawer" else phase
     torch.manual_seed(cfg.seed)
     returns, successes = [], []
-    for index in tqdm(range(cfg.eval_episodes), "evaluation", leave=False, disable=None):
+    for index in tqdm(range(cfg.eval_episodes), "episodes", leave=False, disable=None):
         episode, state = Episode(env, derived_seed(cfg.seed, "evaluate", index), phase), None
         while not episode.over:
             action = episode.random_action()
@@ -1297,7 +1297,7 @@ def finished_runs(folder):
     return [path for path in paths if read_checkpoint(path)["finished"]]
 
 def find_teacher(cfg):
-    """--teacher, or one of --src and --method → (its path, its VideoPredictor)."""
+    """--teacher, or one of --src and --method → (path, VideoPredictor)."""
     found = [Path(cfg.teacher)] if cfg.teacher else finished_runs(run_folder(cfg, "pretrain"))
     command = (f"run: python diswm.py pretrain --src {cfg.src} --method {cfg.method} "
                f"--seed {cfg.seed} --runs {cfg.runs}, with the same --preset")
@@ -1427,7 +1427,7 @@ def join(pictures):
     return np.concatenate(np.concatenate(pictures, 1), 1)
 
 def draw_grid(pictures, rows, columns, path, title=""):
-    """pictures (rows, columns, 64, 64, 3) as a labelled PNG, at twice their size."""
+    """(rows, columns, 64, 64, 3) as a labelled PNG, twice as large."""
     from matplotlib.figure import Figure  # slow to import
     picture = join(pictures)
     size = picture.shape[1] / 100, len(picture) / 100
@@ -1455,7 +1455,7 @@ def picture_grids(run, model):
         yield "traversal", *latent_traversal(model, batch), ["recon.", *TRAVERSAL]
 
 def traverse(run, **changes):
-    """Draw a run's open_loop.png and, of a β-VAE, traversal.png (Figs. 5, 6)."""
+    """Draw a run's open_loop.png and, of a β-VAE, traversal.png."""
     cfg, model, saved = open_run(run / "checkpoint.pt", **changes)
     title = run_folder(replace(saved["config"], runs=""), saved["stage"])
     step = saved["done"]["env_steps"] or saved["done"]["updates"]
@@ -1474,7 +1474,7 @@ def doctor(tasks=FAMILIES):
 
 # === Command line ===
 COLLECT = "src seed runs collect_steps environment acting models behaviour machine "
-COMMANDS = dict(  # groups of Config's fields, and single ones, that are flags of each
+COMMANDS = dict(  # groups and single fields of Config that are flags of each
     collect=COLLECT,
     pretrain=COLLECT + "method tag videos pretrain_updates encoder z_dim beta1 beta2",
     finetune="src dst method tag seed runs teacher steps switch environment acting models encoder "
