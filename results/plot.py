@@ -179,6 +179,7 @@ def draw(result, path, metric="eval_return"):
             switches.add(switch)
         axes.set(title=panel, ylim=(min(0, axes.get_ylim()[0]), None),  # the pusher's are below 0
                  xlabel="env steps", ylabel=AXIS.get(metric, metric))
+        axes.locator_params(axis="x", nbins=6)
         axes.grid(alpha=0.3)
     if switches:
         handles.append(Line2D([], [], color="gray", ls=":", label="the colours change"))
