@@ -82,19 +82,21 @@ try:
 except (AttributeError, ImportError, RuntimeError) as error:  # of missing libraries
     raise OpenGLError(f"error: {GL}: {error}; {GL_REMEDY}") from error
 PROCESS = os.getpid()
+VERSIONS = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
 mujoco.Renderer._gl_context = mujoco.Renderer._mjr_context = None  # one that fails can close
 
 # === Config ===
 @dataclass(frozen=True)
 class Config:
-    """The comments are the flags' help. Values are of the paper's (table) or, by default, of the
-    published configuration. A *decision* is an action, held for `action_repeat` env steps."""
+    """The comments are the flags' help. Values are the paper's (table) or, unmarked, the published
+    configuration's. A *decision* is an action, held for `action_repeat` env steps."""
     # --- run: what, where it is kept, how long
     preset: str = "paper"  # sizes; without CUDA: small (ours)
     src: str = "cheetah_run"  # task of the distracting videos (paper)
     dst: str = "walker_walk"  # target task (paper)
     method: str = "diswm"  # the paper's method, a baseline or an ablation (paper)
     seed: int = 0  # seed of everything random (ours)
+    tag: str = ""  # sets a run of other settings apart (ours)
     runs: str = "runs"  # folder of all runs (ours)
     teacher: str = ""  # a teacher's checkpoint.pt; empty: the one for --src (ours)
     videos: str = ""  # folder of episodes, *.npy; empty: collect's (ours)
@@ -105,9 +107,9 @@ class Config:
     # --- environment (section 4)
     action_repeat: int = 2  # env steps per decision
     time_limit: int = 0  # env steps per episode; 0: the task's own (ours)
-    colors: str = "published"  # boxes around fixed centres or the original colours (paper)
+    colors: str = "published"  # around fixed centres or the original colours (paper)
     color_range: float = 0.2  # half width of a box, RGB in 0..1
-    fast_render: bool = False  # no anti-aliasing, about twice as fast (ours)
+    fast_render: bool = False  # no anti-aliasing, twice as fast (ours)
     camera: str = ""  # one of the task's, by name; empty: one that shows it (ours)
     # --- acting, and how often to learn
     prefill: int = 2500  # decisions at random before learning
@@ -133,7 +135,7 @@ class Config:
     z_dim: int = 20  # size of the β-VAE latent (table)
     beta: float = 0.015  # β, weight of the disentanglement loss in Eq. (5) (table)
     beta1: float = 1.0  # β₁, weight of the action-free KL in Eq. (2) (table)
-    beta2: float = 0.015  # β₂, weight of the disentanglement loss in Eq. (2) (table)
+    beta2: float = 0.015  # β₂, the same in Eq. (2) (table)
     # --- distillation, Eq. (3); its clock counts all decisions
     eta: float = 0.1  # η at the start (table)
     eta_end: float = 0.01  # η at the end (paper, section 3.4)
@@ -157,21 +159,24 @@ class Config:
     device: str = "auto"  # where it runs (ours)
     precision: str = "auto"  # of convolutions and MLPs; auto: bf16 where native (ours)
     threads: int = 0  # CPU threads; 0: one per core (ours)
+    wandb: str = ""  # project to log to as well, after: pip install wandb (ours)
 
     def __post_init__(self):
-        """Raises UsageError at values that cannot be meant."""
+        """Refuse values that cannot be meant."""
         for name, value in vars(self).items():
+            if name in CHOICES and value not in CHOICES[name]:
+                raise UsageError(f"{flag_name(name)} {value}: not of {', '.join(CHOICES[name])}")
             low = LOWEST.get(name, 1 if type(value) is int else 0)
             if type(value) in (int, float) and not low <= value < 2**62:  # nor NaN
                 raise UsageError(f"{flag_name(name)} {value}: not {low} or more")
 
 LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_delay=-1,
-              batch_length=2)  # else a whole number is at least 1, any other at least 0
+              batch_length=2)  # else 1 for a whole number, 0 for others
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
                carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
                device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
 MAY_CHANGE = ("preset", "runs", "teacher", "videos", "device", "precision", "threads",  # of a run
-              "switch", "steps", "collect_steps", "pretrain_updates", "eval_episodes")
+              "switch", "steps", "collect_steps", "pretrain_updates", "eval_episodes", "wandb")
 
 def flag_name(name):
     """lambda_ → --lambda"""
@@ -965,7 +970,7 @@ class ActorCritic(nn.Module):
     def actor_metrics(self, feat):
         """Is the actor alive, and does it heed the state? Of states (N, S + D)."""
         policy = self.policy(feat)
-        (mode, _), (action, _) = self.squash(policy.mean), self.squash(policy.sample())
+        (mode, _), (action, _) = self.squash(policy.mean), self.squash(policy.rsample())
         return dict(actor_slope=(1 - mode**2).mean(), actor_std=policy.stddev.mean(),
                     actor_spread=policy.mean.std(0).mean(),  # over states
                     actor_saturated=(action.abs() > 0.99).float().mean())
@@ -991,14 +996,13 @@ def to_device(batch, device):
 
 def adam(module, lr):
     """The optimiser of a module's parameters; ε as published."""
-    return torch.optim.Adam(module.parameters(), lr, eps=1e-5)
+    return torch.optim.Adam(module.parameters(), lr, eps=1e-5, fused=True)
 
 def descend(loss, optimizer, clip):
     """A step by the optimiser's parameters alone → the gradient's norm, which is clipped."""
     parameters = optimizer.param_groups[0]["params"]
-    gradients = torch.autograd.grad(loss, parameters, materialize_grads=True)
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
+    optimizer.zero_grad()
+    loss.backward(inputs=parameters)
     norm = nn.utils.clip_grad_norm_(parameters, clip)
     optimizer.step()
     return norm
@@ -1085,9 +1089,10 @@ def prepare_machine(cfg):
 
 # === Runs: folders, checkpoints, logs ===
 def run_folder(cfg, stage):
-    """<runs>/<stage>/<tasks>/<method>/seed<k>: the same command finds its run again."""
+    """<runs>/<stage>/<tasks>/<method>[+<tag>]/seed<k>"""
     tasks = f"{cfg.src}-{cfg.dst}" if stage == "finetune" else cfg.src
-    return Path(cfg.runs) / stage / tasks.replace("/", "_") / cfg.method / f"seed{cfg.seed}"
+    method = f"{cfg.method}+{cfg.tag}".rstrip("+").replace("/", "_")
+    return Path(cfg.runs) / stage / tasks.replace("/", "_") / method / f"seed{cfg.seed}"
 
 def read_checkpoint(path):
     """A checkpoint, loaded without executing code. No path in it is followed."""
@@ -1101,7 +1106,7 @@ class Run:
         check_task(cfg.src)
         check_task(cfg.dst)
         self.cfg, self.stage, self.fresh, self.log, self.inputs = cfg, stage, fresh, "", {}
-        self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0)
+        self.done = SimpleNamespace(env_steps=0, decisions=0, updates=0, episodes=0, seconds=0.0)
         self.folder = run_folder(cfg, stage)
         self.resumes = (self.folder / "checkpoint.pt").exists() and not fresh
         if self.resumes:
@@ -1115,7 +1120,7 @@ class Run:
                 differ = [f"--preset {old['preset']} (now {new['preset']})"]
             if differ:
                 raise UserError(f"{self.folder} was started with other flags: add "
-                                f"{', '.join(differ)}, or --fresh")
+                                f"{', '.join(differ)}, or --fresh, or another --tag")
             switch, moved = (color_phase(c, -1)[1] for c in (self.saved["config"], cfg))
             if switch != moved and min(switch, moved) < self.done.env_steps:
                 raise UserError(f"{self.folder} changes colours at step {switch}: "
@@ -1126,7 +1131,7 @@ class Run:
         digest = hashlib.sha256()
         for file in files:
             with open(file, "rb") as content:
-                digest.update(hashlib.file_digest(content, "sha256").digest())
+                hashlib.file_digest(content, lambda: digest)  # goes on with it
         now = f"{flag_name(name)} {path} of sha256 {digest.hexdigest()[:12]}"
         log.info("%s", now)
         before = self.inputs.setdefault(name, now)
@@ -1136,8 +1141,8 @@ class Run:
     def start(self, unit, total, **parts):
         """Make and lock the folder; parts go on from its checkpoint."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import
-        self.unit, self.total, self.parts = unit, total, parts
-        begin = getattr(self.done, unit)
+        self.unit, self.total, self.parts, self.shown = unit, total, parts, {}
+        begin, self.before = getattr(self.done, unit), self.done.seconds
         self.folder.mkdir(parents=True, exist_ok=True)
         self.lock = open(self.folder / "lock", "w")  # noqa: SIM115  while the process lives
         try:
@@ -1152,35 +1157,47 @@ class Run:
             for path in set(self.folder.iterdir()) - {self.folder / "lock"}:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             self.save()
-        log.info(f"{self.folder}, at {begin:,} of {total:,} {unit}, on {self.cfg.device}")
+        if begin < total:  # a line for each start
+            git = os.popen(f"git -C '{Path(__file__).parent}' describe --always --dirty")
+            row = dict(begin=begin, commit=git.read().strip(), machine=os.uname(), **VERSIONS)
+            with open(self.folder / "provenance.jsonl", "a") as file:
+                file.write(json.dumps(row | self.inputs) + "\n")
+        log.info(f"{self.folder}, at {begin:,} of {total:,} {unit}, on {self.cfg.device} with "
+                 f"{self.cfg.precision}")
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
         self.bar._time = time.monotonic  # clocks may be set back
         self.bar.start_t = self.bar.last_print_t = time.monotonic()
+        if self.cfg.wandb:
+            import wandb
+            wandb.init(project=self.cfg.wandb, config=vars(self.cfg),
+                       sync_tensorboard=True, reinit="finish_previous")
         self.writer = SummaryWriter(self.folder, purge_step=begin + 1, flush_secs=5)
 
     def record(self, **row):
         """Log a row of metrics, and save a checkpoint."""
         done, seconds = getattr(self.done, self.unit), self.bar.format_dict["elapsed"]
-        row |= dict(seconds=seconds, rate=(done - self.bar.initial) / seconds)
+        self.done.seconds = self.before + seconds  # of all resumes
+        row |= dict(seconds=self.done.seconds, rate=(done - self.bar.initial) / seconds)
         self.log += json.dumps(row) + "\n"
         for name, value in row.items():
             if isinstance(value, (int, float)):
                 self.writer.add_scalar(name, value, done)
         self.save()
         shown = ("train_return", "eval_return", "image", "reward", "kl", "disentangle", "eta")
-        self.bar.set_postfix({name: row[name] for name in shown if name in row}, refresh=False)
+        self.shown |= {name: row[name] for name in shown if name in row}
+        self.bar.set_postfix(self.shown, refresh=False)
         self.bar.update(done - self.bar.n)
         if not sys.stderr.isatty():
             log.info("%s", self.bar)
 
     def save(self):
-        """Write config and log, for people, and the checkpoint."""
+        """Write the checkpoint and, for people, its config and log."""
         config, file = vars(self.cfg), io.BytesIO()  # a full disk is the file's error
         state = {name: part.state_dict() for name, part in self.parts.items()}
-        finished = getattr(self.done, self.unit) >= self.total
-        torch.save(dict(config=config, stage=self.stage, log=self.log, done=vars(self.done),
-                        finished=finished, inputs=self.inputs) | state, file)
+        state |= dict(config=config, stage=self.stage, log=self.log, done=vars(self.done),
+                      inputs=self.inputs)
+        torch.save(state | dict(finished=state["done"][self.unit] >= self.total), file)
         write_whole(self.folder / "config.json", json.dumps(config, indent=2).encode())
         write_whole(self.folder / "metrics.jsonl", self.log.encode())
         write_whole(self.folder / "checkpoint.pt", file.getbuffer())
@@ -1203,9 +1220,8 @@ def train_video_predictor(cfg, run, videos):
     model, done, metrics = VideoPredictor(cfg).to(cfg.device), run.done, []
     optimizer = adam(model, cfg.model_lr)
     run.start("updates", cfg.pretrain_updates, model=model, optimizer=optimizer)
-    shown = Replay(run.folder / "episodes")
-    if not shown.paths:  # one video stays with the run, for `traverse`
-        shown.add(videos.read(videos.paths[-1])[-1000:])  # however long
+    if not (run.folder / "episodes").exists():  # one video stays, for `traverse`
+        Replay(run.folder / "episodes").add(videos.read(videos.paths[-1])[-1000:])
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
         torch.manual_seed(rng.integers(2**63))  # of all noise
@@ -1275,6 +1291,8 @@ def train_agent(cfg, run, env, agent):
             result, _ = evaluate_agent(cfg, env, agent, phase)
             row |= {f"eval_{name}": value for name, value in result.items()}
             row["eval_step"] = due if due > began else cfg.steps
+            for name, pictures, *_ in picture_grids(run.folder, agent.model):
+                run.writer.add_image(name, join(pictures), done.env_steps, dataformats="HWC")
         run.record(**row)
 
 def evaluate_agent(cfg, env, agent, phase, explore=False):
@@ -1284,7 +1302,7 @@ def evaluate_agent(cfg, env, agent, phase, explore=False):
     phase = "eval" if family(cfg.dst) == "drawer" else phase
     torch.manual_seed(cfg.seed)
     returns, successes = [], []
-    for index in range(cfg.eval_episodes):
+    for index in tqdm(range(cfg.eval_episodes), "episodes", leave=False, disable=None):
         episode, state = Episode(env, derived_seed(cfg.seed, "evaluate", index), phase), None
         while not episode.over:
             action = episode.random_action()
@@ -1307,12 +1325,11 @@ def open_run(path, **changes):
     cfg = prepare_machine(replace(saved["config"], **changes))
     with reading(path, "checkpoint of ours"):
         if saved["stage"] == "pretrain":
-            model = VideoPredictor(cfg).to(cfg.device)
-            model.load_state_dict(saved["model"])
+            model, name = VideoPredictor(cfg).to(cfg.device), "model"
         else:
             *_, last_bias = (value for name, value in saved["agent"].items() if ".actor." in name)
-            model = Agent(cfg, len(last_bias) // 2)  # a mean and a std for each action
-            model.load_state_dict(saved["agent"])
+            model, name = Agent(cfg, len(last_bias) // 2), "agent"  # of means and stds
+        model.load_state_dict(saved[name])
     return cfg, model, saved
 
 def finished_run(folder):
@@ -1340,17 +1357,17 @@ def find_teacher(cfg):
 def collect(cfg, fresh=False):
     """Learn in the distracting source task; the replay is the video set (stage 1)."""
     # In the first colours, and without what only pretraining sets.
-    cfg = replace(cfg, dst=cfg.src, method="dreamerv2", steps=cfg.collect_steps, switch=1.0,
-                  pretrain_updates=1, z_dim=1, beta1=0.0, **METHODS["dreamerv2"])
+    cfg = replace(cfg, dst=cfg.src, tag="", method="dreamerv2", steps=cfg.collect_steps,
+                  switch=1.0, pretrain_updates=1, z_dim=1, beta1=0.0, **METHODS["dreamerv2"])
     return finetune(cfg, fresh, "collect")
 
 def pretrain(cfg, fresh=False):
-    """Train the β-VAE video predictor (stage 2; collects videos first if there are none)."""
+    """Train the video predictor (stage 2), on collect's videos or --videos."""
     cfg = replace(cfg, dst=cfg.src)
     run = Run(cfg, "pretrain", fresh)
     folder = cfg.videos
     if not folder:
-        found = finished_run(run_folder(replace(cfg, method="dreamerv2"), "collect"))
+        found = finished_run(run_folder(replace(cfg, method="dreamerv2", tag=""), "collect"))
         folder = (found.parent if found else collect(cfg)) / "episodes"
     videos = Replay(folder)
     if videos.bounds[-1] < cfg.batch_length:
@@ -1365,7 +1382,7 @@ def finetune(cfg, fresh=False, stage="finetune"):
         raise UserError(f"--src and --dst are both {cfg.src}; choose another")
     run, video = Run(cfg, stage, fresh), None
     if (cfg.eta > 0 or cfg.carry_over != "none") and (cfg.teacher or not run.resumes):
-        path, video = find_teacher(cfg)
+        path, video = find_teacher(replace(cfg, tag=""))
         run.check_input("teacher", path, [path])
     with config_env(cfg, cfg.dst) as env:
         torch.manual_seed(cfg.seed)  # of the weights
@@ -1411,23 +1428,24 @@ def to_picture(image):
     return ((image.movedim(-3, -1) + 0.5).clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 @torch.no_grad()
-def latent_traversal(model, batch):
-    """Vary one latent at a time (Fig. 5) in the first image of a window (1, T, ...) →
-    uint8 (Z, 1 + values, 64, 64, 3), the reconstruction first; each latent's KL, nats, (Z,)."""
+def latent_traversal(model, batch, values=TRAVERSAL):
+    """Vary one latent at a time (Fig. 5) in a window's first image; informative ones first →
+    uint8 (Z, 1 + values, 64, 64, 3), the reconstruction first; names."""
     out = model(batch)
     mean, logvar = out["code"]["mean"][0], out["code"]["logvar"][0]  # (T, Z)
     latents = torch.arange(mean.shape[1])
-    z = mean[0].repeat(len(latents), 1 + len(TRAVERSAL), 1)  # (Z, 1 + values, Z)
-    z[latents, 1:, latents] = z.new_tensor(TRAVERSAL)
+    z = mean[0].repeat(len(latents), 1 + len(values), 1)  # (Z, 1 + values, Z)
+    z[latents, 1:, latents] = z.new_tensor(values)
     deter = out["post"]["deter"][0, 0].expand(*z.shape[:2], -1)  # all else is in 𝐳
     feat = torch.cat([model.rssm.posterior(deter, z)["mean"], deter], -1)
-    kl = beta_vae_kl(mean[..., None], logvar[..., None])  # (T, Z): of each
-    return to_picture(model.decoder(feat)), kl.mean(0).cpu().numpy()
+    nats = beta_vae_kl(mean[..., None], logvar[..., None]).mean(0)  # of each
+    order = nats.argsort(descending=True)
+    names = [f"z{i}  {nats[i]:.2f} nats" for i in order]
+    return to_picture(model.decoder(feat[order])), names
 
 @torch.no_grad()
 def open_loop(model, batch, context=5):
-    """Filter `context` images of a window (1, T, ...), predict the others from its actions.
-    Returns uint8 (3, T, 64, 64, 3): truth, model, error."""
+    """Truth, prediction from `context` images and all actions, error: (3, T, 64, 64, 3)"""
     out = model({name: value[:, :context] for name, value in batch.items()})
     state = {name: value[:, -1] for name, value in out["post"].items()}
     feats = [out["feat"]]
@@ -1439,45 +1457,56 @@ def open_loop(model, batch, context=5):
     prediction = model.decoder(torch.cat(feats, 1))[0].clamp(-0.5, 0.5)
     return to_picture(torch.stack([truth, prediction, (prediction - truth) / 2]))
 
+def join(pictures):
+    """(rows, columns, h, w, 3) → one picture, with thin gaps"""
+    pictures = np.pad(pictures, [(0, 0), (0, 0), (1, 1), (1, 1), (0, 0)], constant_values=255)
+    return np.concatenate(np.concatenate(pictures, 1), 1)
+
 def draw_grid(pictures, rows, columns, path, title=""):
-    """pictures (rows, columns, 64, 64, 3) as one labelled PNG."""
+    """(rows, columns, 64, 64, 3) as a labelled PNG, twice as large."""
     from matplotlib.figure import Figure  # slow to import
-    r, c = pictures.shape[:2]
-    axes = Figure(figsize=(c * 0.75 + 1, r * 0.75 + 0.5)).subplots()
-    axes.imshow(pictures.swapaxes(1, 2).reshape(r * 64, c * 64, 3))
-    axes.set(title=title, frame_on=False, yticks=np.arange(r) * 64 + 32, yticklabels=rows,
-             xticks=np.arange(c) * 64 + 32, xticklabels=columns)
+    picture = join(pictures)
+    size = picture.shape[1] / 100, len(picture) / 100
+    axes = Figure(figsize=size).add_axes((0, 0, 1, 1))
+    axes.imshow(picture, interpolation="nearest")
+    axes.set(title=title, frame_on=False, yticks=range(33, len(picture), 66), yticklabels=rows,
+             xticks=range(33, picture.shape[1], 66), xticklabels=columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.figure.savefig(path, dpi=100, bbox_inches="tight")
+    axes.figure.savefig(path, dpi=200, bbox_inches="tight")
     log.info("wrote %s", path)
 
-def traverse(run, out=None, **changes):
-    """Draw a run's open_loop.png and, of a β-VAE, traversal.png, from its last episode."""
-    cfg, model, _ = open_run(run / "checkpoint.pt", **changes)
-    dtype = VIDEO_ROW
-    if isinstance(model, Agent):
-        dtype, model = agent_row(model.action_dim), model.model
-    replay = Replay(run / "episodes", dtype)
+def picture_grids(run, model):
+    """Of a run's last episode: name, pictures, names of rows, of columns."""
+    actions = model.rssm.action_dim
+    replay = Replay(run / "episodes", agent_row(actions) if actions else VIDEO_ROW)
     if not replay.paths:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
     rows = replay.read(replay.paths[-1])
-    rows = rows[len(rows) // 2:][:50]  # the last colours
-    batch = to_device({name: np.array(rows[name])[None] for name in dtype.names}, cfg.device)
-    batch["is_first"][:, 0] = True
+    shown = np.linspace(0, len(rows) - 1, 12).astype(int)
+    yield "film", rows["image"][shown][None], [""], shown
+    batch = {name: np.array(rows[name][:50])[None] for name in replay.dtype.names}
+    batch = to_device(batch, model.cfg.device)
+    strip = open_loop(model, batch)[:, ::5]
+    columns = ["0\nseen", "5\npredicted", *range(10, 50, 5)][:strip.shape[1]]
+    yield "open_loop", strip, ("truth", "model", "error"), columns
+    if model.cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
+        yield "traversal", *latent_traversal(model, batch), ["recon.", *TRAVERSAL]
+
+def traverse(run, out=None, **changes):
+    """Draw a run's film.png, open_loop.png and, of a β-VAE, traversal.png and .mp4."""
+    cfg, model, saved = open_run(run / "checkpoint.pt", **changes)
+    title = run_folder(replace(saved["config"], runs=""), saved["stage"])
+    step = saved["done"]["env_steps"] or saved["done"]["updates"]
     torch.manual_seed(cfg.seed)
-    strip = open_loop(model, batch)[:, ::4]
-    draw_grid(strip, ("truth", "model", "error"), range(0, 4 * strip.shape[1], 4),
-              (out or run) / "open_loop.png", "predicted, not seen: frames 5 …")
-    if cfg.encoder == "beta_vae" and not hasattr(model.rssm, "below"):
-        pictures, nats = latent_traversal(model, batch)
-        order = np.argsort(-nats)  # informative first
-        labels = [f"z{i}  {nats[i]:.2f} nats" for i in order]
-        draw_grid(pictures[order], labels, ["recon.", *TRAVERSAL], (out or run) / "traversal.png")
+    for name, *grid in picture_grids(run, getattr(model, "model", model)):
+        draw_grid(*grid, (out or run) / f"{name}.png", f"{title}, step {step:,}")
+        if name == "traversal":  # a frame for each value, of the ten most informative latents
+            frames = [join(latents[None, :10]) for latents in grid[0].swapaxes(0, 1)[1:]]
+            iio.imwrite((out or run) / "traversal.mp4", np.stack(frames), fps=3)
 
 def doctor(tasks=FAMILIES):
-    """Render each phase of tasks into doctor.png (Fig. 3), and say what runs here."""
-    versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
-    log.info("%s, CUDA: %s", versions, torch.cuda.is_available())
+    """Draw each phase of tasks (Fig. 3), doctor.png, and say what runs here."""
+    log.info("%s, CUDA: %s", VERSIONS, torch.cuda.is_available())
     pictures = np.empty((len(tasks), len(PHASES), 64, 64, 3), np.uint8)
     for task, row in zip(tasks, pictures, strict=True):
         with make_env(task) as env:
@@ -1486,10 +1515,10 @@ def doctor(tasks=FAMILIES):
 
 # === Command line ===
 COLLECT = "preset src seed runs collect_steps environment acting models behaviour machine "
-COMMANDS = dict(  # groups of Config's fields, and single ones, that are flags of each
+COMMANDS = dict(  # groups and single fields of Config that are flags of each
     collect=COLLECT,
-    pretrain=COLLECT + "method videos pretrain_updates encoder z_dim beta1 beta2",
-    finetune="preset src dst method seed runs teacher steps switch environment acting models "
+    pretrain=COLLECT + "method tag videos pretrain_updates encoder z_dim beta1 beta2",
+    finetune="preset src dst method tag seed runs teacher steps switch environment acting models "
              "encoder carry_over bonus z_dim beta distillation behaviour machine",
     evaluate="dst seed environment eval_episodes device threads",
     traverse="seed device threads", doctor="")
@@ -1554,7 +1583,9 @@ def main(argv=None):
         return 0
     except UserError as error:
         message, code = str(error), 2 if isinstance(error, UsageError) else 1
-    except (OSError, UnicodeError) as error:
+    except torch.OutOfMemoryError as error:
+        message, code = f"{error}".split(". ")[0] + "; try a smaller --batch-size", 1
+    except (ImportError, OSError, UnicodeError) as error:
         message, code = f"{error}; mend that and run the same command again", 1
     except KeyboardInterrupt:
         message, code = "interrupted; run it again: training goes on from its checkpoint", 130

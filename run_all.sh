@@ -19,12 +19,16 @@ usage() {
 usage: bash run_all.sh                 a tour of the whole pipeline: ten minutes on two CPU cores
        PRESET=small bash run_all.sh    the real thing, sized for two CPU cores: hours
        PRESET=paper bash run_all.sh    the paper's size: wants a GPU
+       bash run_all.sh list            prints the commands instead, one a line, teachers first
        bash run_all.sh test [ARGS]     ruff and the tests; ARGS go to pytest, as in: test -k replay
 
 What the pipeline runs, each a list separated by spaces:
        PAIRS      source:target tasks, by default "cheetah_run:walker_walk"
        METHODS    methods of diswm.py, by default "diswm"
        SEEDS      seeds of the finetunings, by default "0"
+       JOBS       finetunings side by side, by default 1 on a GPU, else one per core
+       SWEEP      values to compare, of diswm alone: SWEEP="eta=0.01,0.1,1", or beta, beta2, z_dim;
+                  each is a run of its own, tagged diswm+eta=0.01; beta2, z_dim get a teacher each
 
 Set-up: PYTHON=/path/to/python makes .venv with that Python; MUJOCO_GL=osmesa renders without EGL.
 EOF
@@ -126,8 +130,8 @@ diswm() {
 }
 
 read_settings() {  # environment variables -> size, collect, pretrain, finetune (flags of the
-                   # stages), runs, pairs, methods, trainings
-    local preset=${PRESET:-tour} pair method seed
+                   # stages), runs, pairs, methods, settings, trainings
+    local preset=${PRESET:-tour} pair method seed setting once=" "
     case $preset in
         tour)
             size=("${tour[@]}")
@@ -135,7 +139,7 @@ read_settings() {  # environment variables -> size, collect, pretrain, finetune 
             pretrain=("${tour_collect[@]}" "${tour_pretrain[@]}")
             finetune=("${tour_finetune[@]}")
             ;;
-        small | paper)
+        small | paper | debug)
             size=(--preset "$preset")
             collect=() pretrain=() finetune=()
             ;;
@@ -144,20 +148,72 @@ read_settings() {  # environment variables -> size, collect, pretrain, finetune 
     runs=runs/$preset  # apart, since a run only goes on with the settings that it was started with
     size+=(--runs "$runs")
 
+    if [[ ! ${JOBS:-1} =~ ^[1-9][0-9]*$ ]]; then
+        die "JOBS=$JOBS is no number of finetunings, as in JOBS=3" 2
+    fi
     pairs=${PAIRS:-cheetah_run:walker_walk}
     methods=${METHODS:-diswm}
+    read_sweep
     trainings=()  # of each finetuning: its run folder, then its flags
     for pair in $pairs; do
         if [[ ! $pair =~ ^[A-Za-z0-9_-]+:[A-Za-z0-9_-]+$ || ${pair%:*} == "${pair#*:}" ]]; then
             die "PAIRS: '$pair' is not two different tasks, as in cheetah_run:walker_walk" 2
         fi
         for method in $methods; do
-            for seed in ${SEEDS:-0}; do
-                trainings+=("$runs/finetune/${pair/:/-}/$method/seed$seed ${size[*]} ${finetune[*]}\
- --src ${pair%:*} --dst ${pair#*:} --method $method --seed $seed")
+            if ! needs_videos "$method"; then  # whatever the source: once per target
+                [[ $once == *" $method:${pair#*:} "* ]] && continue
+                once+="$method:${pair#*:} "
+            fi
+            for setting in "${settings[@]}"; do
+                for seed in ${SEEDS:-0}; do
+                    trainings+=("$runs/finetune/${pair/:/-}/$method${setting:++}$setting/seed$seed\
+ ${size[*]} ${finetune[*]} --src ${pair%:*} --dst ${pair#*:} --method $method --seed $seed\
+ $(finetune_flags "$setting" "${pair%:*}")")
+                done
             done
         done
     done
+}
+
+needs_videos() {  # METHOD
+    [[ $1 != dreamerv2 && $1 != no_distill ]]
+}
+
+read_sweep() {  # SWEEP="a=1,2 b=3" -> settings=(a=1 a=2 b=3), or one empty one
+    local entry value
+    settings=()
+    for entry in ${SWEEP:-}; do
+        if [[ ! $entry =~ ^[a-z0-9_]+=[0-9.e,-]+$ || $methods != diswm ]]; then
+            die "SWEEP: '$entry' is not NAME=VALUE,… as in eta=0.01,0.1,1, or METHODS is not diswm" 2
+        fi
+        local values=${entry#*=}
+        for value in ${values//,/ }; do
+            settings+=("${entry%%=*}=$value")
+        done
+    done
+    settings=("${settings[@]:-}")
+}
+
+own_teacher() {  # SETTING: does it change the pretraining?
+    [[ $1 == beta2=* || $1 == z_dim=* || $1 == beta1=* ]]
+}
+
+setting_flags() {  # eta=0.1 -> --tag eta=0.1 --eta 0.1
+    local name=${1%%=*}
+    echo "--tag $1 --${name//_/-} ${1#*=}"
+}
+
+finetune_flags() {  # SETTING SOURCE
+    local flags
+    [[ -n $1 ]] || return 0
+    flags=$(setting_flags "$1")
+    if [[ $1 == beta[12]=* ]]; then  # of pretraining alone
+        flags="--tag $1"
+    fi
+    if own_teacher "$1"; then
+        flags+=" --teacher $runs/pretrain/$2/diswm+$1/seed0/checkpoint.pt"
+    fi
+    echo "$flags"
 }
 
 check_settings() {  # a misspelt target or method must not show only after hours of pretraining
@@ -175,18 +231,40 @@ except diswm.UserError as error:
     sys.exit(2)'
 }
 
-pretrain_teachers() {  # one per pair and method, with seed 0: it serves all seeds
-    local pair method
-    for pair in $pairs; do
+teacher_commands() {  # one per source and method, with seed 0: it serves all seeds
+    local source method setting flags
+    for source in $(printf '%s\n' $pairs | sed 's/:.*//' | sort -u); do
         for method in $methods; do
-            case $method in
-                dreamerv2 | no_distill) ;;  # learn without videos
-                *)
-                    diswm collect --src "${pair%:*}" "${size[@]}" "${collect[@]}"
-                    diswm pretrain --src "${pair%:*}" --method "$method" "${size[@]}" "${pretrain[@]}"
-                    ;;
-            esac
+            needs_videos "$method" || continue
+            echo "collect --src $source ${size[*]} ${collect[*]}"
+            for setting in "${settings[@]}"; do
+                flags=
+                if own_teacher "$setting"; then
+                    flags=$(setting_flags "$setting")
+                fi
+                echo "pretrain --src $source --method $method ${size[*]} ${pretrain[*]} $flags"
+            done
         done
+    done | awk '!seen[$0]++'  # several methods share their videos
+}
+
+pretrain_teachers() {
+    local command words
+    while read -r command; do
+        read -ra words <<<"$command"
+        diswm "${words[@]}" </dev/null
+    done < <(teacher_commands)
+}
+
+list_commands() {  # those of one source must wait for each other, so they share a line
+    local training
+    teacher_commands | awk '
+        { source = $3; line = ".venv/bin/python diswm.py " $0
+          if (source in lines) lines[source] = lines[source] " && " line
+          else { order[++n] = source; lines[source] = line } }
+        END { for (i = 1; i <= n; i++) print lines[order[i]] }'
+    for training in "${trainings[@]}"; do
+        echo ".venv/bin/python diswm.py finetune ${training#* }"
     done
 }
 
@@ -207,10 +285,13 @@ has_cuda() {
 }
 
 finetune_all() {
-    local training flags cores side_by_side
+    local training flags cores side_by_side=${JOBS:-}
     cores=$(nproc)
-    side_by_side=$((${#trainings[@]} < cores ? ${#trainings[@]} : cores))
-    if [[ $side_by_side == 1 ]] || has_cuda; then
+    if [[ -z $side_by_side ]]; then
+        side_by_side=$(has_cuda && echo 1 || echo "$cores")
+    fi
+    side_by_side=$((${#trainings[@]} < side_by_side ? ${#trainings[@]} : side_by_side))
+    if [[ $side_by_side == 1 ]]; then
         for training in "${trainings[@]}"; do
             read -ra flags <<<"${training#* }"
             diswm finetune "${flags[@]}"
@@ -220,32 +301,44 @@ finetune_all() {
     # Each gets its share of the cores: two trainings on the same two cores slow each other tenfold.
     # xargs stays in the foreground, so that Ctrl-C reaches every training.
     export -f diswm finetune_into_log
-    printf "%s --threads $((cores / side_by_side))\n" "${trainings[@]}" |
+    printf "%s --threads $((cores > side_by_side ? cores / side_by_side : 1))\n" "${trainings[@]}" |
         xargs -P "$side_by_side" -L 1 bash -c 'finetune_into_log "$@"' finetune_into_log ||
         die "a finetuning failed, see above; run the same command again to go on"
 }
 
 show_results() {
-    local pair training run
+    local pair training run logs=() targets="" by=pair
     for training in "${trainings[@]}"; do
         run=${training%% *}
         diswm evaluate --run "$run"
         diswm traverse --run "$run"
     done
+    shopt -s nullglob  # a pair may have no run of its own: methods without videos
     for pair in $pairs; do
-        echo "\$ python results/plot.py $runs/finetune/${pair/:/-}/*/seed*"
-        .venv/bin/python results/plot.py "$runs/finetune/${pair/:/-}"/*/seed* --out "$runs/${pair/:/-}.png"
+        logs+=("$runs/finetune/${pair/:/-}"/*/seed*/)
+        targets+="${pair#*:}"$'\n'
     done
+    shopt -u nullglob
+    if [[ -n $(sort <<<"$targets" | uniq -d) ]]; then  # a target of several sources: Fig. 8
+        by=src
+    fi
+    echo "\$ python results/plot.py --by $by ${logs[*]}"
+    .venv/bin/python results/plot.py --by "$by" --out "$runs/curves.png" "${logs[@]}"
 
     echo
     echo "Done in $((SECONDS / 60)) minutes. In $PWD:"
-    for pair in $pairs; do
-        echo "  learning curves  $runs/${pair/:/-}.png"
-    done
+    echo "  learning curves  $runs/curves.png"
     for training in "${trainings[@]}"; do
         run=${training%% *}
         echo "  pictures, video  $run:" "$(cd "$run" && echo *.png *.mp4)"
     done
+}
+
+say_time() {
+    if [[ $runs != runs/tour ]]; then  # whose time is known
+        echo "Each stage, for one pair, method and seed, takes" \
+            "$(.venv/bin/python results/bench.py --estimate "${size[@]:0:2}")"
+    fi
 }
 
 say_tour() {
@@ -267,6 +360,7 @@ run_tests() {
 run_pipeline() {
     say_tour
     check_settings
+    say_time
     pretrain_teachers
     finetune_all
     show_results
@@ -278,6 +372,11 @@ if [[ $# == 0 ]]; then
     make_venv
     check_opengl
     run_pipeline
+elif [[ $1 == list && $# == 1 ]]; then
+    read_settings
+    make_venv >&2
+    check_settings
+    list_commands
 elif [[ $1 == test ]]; then
     make_venv
     check_opengl

@@ -5,15 +5,15 @@ disentanglement.json and a labelled latent traversal, disentanglement.png, into 
 """
 
 import json
-import sys
 from pathlib import Path
 
+import common
 import mujoco
 import numpy as np
 import torch
+from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import diswm  # noqa: E402
+import diswm
 
 
 def group_name(model, array, rows):
@@ -41,7 +41,7 @@ def labelled_frames(cfg, count):
         # One group white at a time, then none: what changes nothing does not show.
         *lit, dark = [paint(env, colors) for colors in np.eye(len(env.groups) + 1)[:, :-1]]
         shown = [index for index, image in enumerate(lit) if (image != dark).any()]
-        for index in range(count):
+        for index in tqdm(range(count), "frames", leave=False, disable=None):
             if index % 50 == 0 or any(over):  # 50 decisions of an episode
                 seed = diswm.derived_seed(cfg.seed, "evaluate", index)
                 env.reset(seed=seed, options=dict(phase="none"))
@@ -67,7 +67,7 @@ def disentanglement(codes, factors):
     from scipy.stats import entropy  # slow to import
     from sklearn.ensemble import GradientBoostingRegressor
     n, importance, r2, gaps = len(codes) * 3 // 4, [], [], []
-    for factor in factors.T:
+    for factor in tqdm(factors.T, "factors", leave=False, disable=None):
         trees = GradientBoostingRegressor(random_state=0).fit(codes[:n], factor[:n])
         importance.append(trees.feature_importances_ + 1e-12)
         r2.append(max(0.0, trees.score(codes[n:], factor[n:])))
@@ -93,30 +93,18 @@ def encoder_at_start(saved, action_dim):
     torch.manual_seed(cfg.seed)
     return diswm.WorldModel(cfg, action_dim).encoder  # which an Agent makes first
 
-def last_window(run, dtype, device):
-    """A batch of one window, from the middle of the run's last episode."""
-    replay = diswm.Replay(run / "episodes", dtype)
-    if not replay.paths:
-        raise diswm.UserError(f"no episodes in {replay.folder}; nothing to draw from")
-    rows = replay.read(replay.paths[-1])
-    rows = rows[len(rows) // 2:][:50]
-    batch = {name: np.array(rows[name])[None] for name in dtype.names}
-    batch["is_first"][:, 0] = True
-    return diswm.to_device(batch, device)
-
 @torch.no_grad()
 def measure(run, frames=2000, **changes):
     """Score a run's encoders, write JSON and picture. changes: Config values, not the run's own."""
     cfg, model, saved = diswm.open_run(run / "checkpoint.pt", **changes)
-    teacher, action_dim, dtype = None, 0, diswm.VIDEO_ROW
+    teacher, action_dim = None, 0
     if isinstance(model, diswm.Agent):
         teacher, action_dim, model = model.teacher, model.action_dim, model.model
-        dtype = diswm.agent_row(action_dim)
     if cfg.encoder != "beta_vae" or hasattr(model.rssm, "below"):
         raise diswm.UserError(f"{run} has no β-VAE latents to measure")
     if frames < 8:
         raise diswm.UserError(f"{frames} frames are too few to measure anything")
-    batch = last_window(run, dtype, cfg.device)
+    batch = common.last_window(run, model)
     images, factors, names = labelled_frames(cfg, frames)
     encoders = dict(teacher=teacher, start=encoder_at_start(saved, action_dim), end=model.encoder)
     result = dict(task=cfg.dst, factors=names)
@@ -129,12 +117,11 @@ def measure(run, frames=2000, **changes):
             result[name] = scores | dict(share=share.tolist())
             print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")
     (run / "disentanglement.json").write_text(json.dumps(result, indent=2) + "\n")
-    pictures, nats = diswm.latent_traversal(model, batch)
-    order = np.argsort(-nats)  # informative first
-    labels = [f"z{z}  {nats[z]:.2f} nats  {names[share[:, z].argmax()]} {share[:, z].max():.2f}"
-              for z in order]
-    diswm.draw_grid(pictures[order], labels, ["recon.", *diswm.TRAVERSAL],
-                    run / "disentanglement.png")
+    pictures, labels = diswm.latent_traversal(model, batch)
+    for row, label in enumerate(labels):  # z3  2.20 nats
+        explained = share[:, int(label.split()[0][1:])]
+        labels[row] += f"  {names[explained.argmax()]} {explained.max():.2f}"
+    diswm.draw_grid(pictures, labels, ["recon.", *diswm.TRAVERSAL], run / "disentanglement.png")
     print(f"wrote {run}/disentanglement.png and disentanglement.json")
 
 def main(argv=None):
@@ -147,7 +134,4 @@ def main(argv=None):
     measure(**{name: value for name, value in args.items() if value is not None})
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (diswm.UserError, OSError) as error:
-        sys.exit("error: " + " ".join(str(error).split()))
+    common.run_script(main)

@@ -12,15 +12,15 @@ A long video becomes several files of 1000 frames each, of which only one is in 
 import argparse
 import io
 import re
-import sys
 from pathlib import Path
 
+import common
 import imageio.v3 as iio
 import numpy as np
 from PIL import Image
+from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import diswm  # noqa: E402
+import diswm
 
 FILMS = (".mp4", ".gif", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".apng")
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm")
@@ -132,7 +132,7 @@ def import_videos(source, target, crop=False):
         raise diswm.UserError(f"{source} cannot be both; name another folder for the episodes")
     paths = [path for path in find_videos(source) if path.resolve() != target.resolve()]
     target.mkdir(parents=True, exist_ok=True)
-    for path in paths:
+    for path in tqdm(paths, "videos", leave=False, disable=None):
         print(import_video(path, target, crop))
     return len(paths)
 
@@ -147,7 +147,4 @@ def main(argv=None):
     print(f"{args.target}: {count} videos")
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (diswm.UserError, OSError) as error:
-        sys.exit("error: " + " ".join(str(error).split()))
+    common.run_script(main)

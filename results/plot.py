@@ -1,34 +1,79 @@
 """Learning curves of finetune runs: means over seeds with bootstrap 95 % intervals.
 
-A run is a folder …/<tasks>/<method>/seed<k> with a metrics.jsonl. The figures are printed, and
-written beside the picture as JSON: final (mean of the last three evaluations), area (under the
-curve, by its length in env steps), before and after (the evaluations around the change of
-colours). Each is [mean, low, high] over the seeds, or [mean] of one seed.
+A run is a folder …/<tasks>/<method>/seed<k> with a metrics.jsonl. Runs whose config.json agree in
+all but the seed are the seeds of one curve. Beside the picture, and on the terminal, are figures:
+final (mean of the last three evaluations up to final_step, the last that all seeds have), area
+(under the curve up to there, by its length in env steps), before and after (the evaluations around
+the change of colours). Each is [mean, low, high] over the seeds, or [mean] of one seed.
 """
 
 import json
 import re
-import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import common
 import numpy as np
+from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import diswm  # noqa: E402
+import diswm
+
+# Okabe and Ito's, which people who see few colours can tell apart, too.
+COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"
+LINES = "-", "--", ":"
+NO_VIDEOS = "dreamerv2", "no_distill"  # methods for which the source does not matter
+AXIS = dict(eval_return="evaluation return", eval_success="success rate")
 
 
-def read_run(folder):
-    """A run's log → ({env step: evaluation return}, the step of the colours' change, or None)."""
-    curve, last_step = {}, {}
+def read_config(folder):
+    """A run's settings from its config.json, or None where there is none, as in old logs."""
+    path = folder / "config.json"
+    if not path.exists():
+        return None
+    with diswm.reading(path, "config.json of ours", "name other runs"):
+        return dict(tag="") | dict(json.loads(path.read_text()))
+
+def read_run(folder, metric="eval_return"):
+    """A run's log and settings: its curve is {env step: value of the metric}, `switch` the step
+    of the colours' change, or None."""
+    folder, curve, last_step = folder.resolve(), {}, {}
     with diswm.reading(folder / "metrics.jsonl", "log of ours", "name other runs"):
         for line in (folder / "metrics.jsonl").read_text().splitlines():
             row = json.loads(line)
             if "phase" in row:  # else it is of a pretraining
                 last_step[row["phase"]] = int(row["step"])
-            if "eval_return" in row:  # eval_step: when it was due
-                curve[int(row.get("eval_step", row["step"]))] = float(row["eval_return"])
+            if metric in row:  # eval_step: when it was due
+                due = row.get("eval_step", row["step"]) if metric[:5] == "eval_" else row["step"]
+                curve[int(due)] = float(row[metric])
     switch = last_step["train"] if {"train", "shifted"} <= last_step.keys() else None
-    return curve, switch
+    config = read_config(folder)
+    tasks, label, seed = folder.parts[-3:]
+    src, *dst = re.split(r"-(?!v\d)", tasks)  # Hopper-v5 has a hyphen of its own
+    dst = dst[0] if dst else src
+    if config:
+        src, dst, seed = config["src"], config["dst"], f"seed{config['seed']}"
+        label = config["method"] + (f"+{config['tag']}" if config["tag"] else "")
+    return SimpleNamespace(folder=folder, curve=curve, switch=switch, config=config, src=src,
+                           dst=dst, label=label, seed=seed)
+
+def check_seeds(runs, where):
+    """Raise UserError unless runs under one label differ in their seed, and in nothing else."""
+    label, known = runs[0].label, [run for run in runs if run.config]
+    for run in known[1:]:
+        for name, value in known[0].config.items():
+            other = run.config.get(name, value)  # a field that came later says nothing
+            free = name in (*diswm.MAY_CHANGE, "seed", "tag", "src", "note")  # src: `where` has it
+            if value != other and not free:
+                raise diswm.UserError(
+                    f"{known[0].folder} and {run.folder} are both {label}, but {name} is {value} "
+                    f"and {other}; they are no seeds of one method: train one with --tag NAME, or "
+                    "plot them apart")
+    seeds = {}
+    for run in runs:
+        if run.seed in seeds:
+            raise diswm.UserError(f"{seeds[run.seed].folder} and {run.folder} are both {run.seed} "
+                                  f"of {label}, {where}: name one, or train one with --tag NAME")
+        seeds[run.seed] = run
 
 def mean_interval(values):
     """Of values (seeds, ...): [mean, low, high], or [mean] of one seed; lists or floats."""
@@ -40,73 +85,141 @@ def mean_interval(values):
     return [estimate.tolist() for estimate in estimates]
 
 def curve_figures(runs, switch=None):
-    """Figures of a method. runs: {env step: return} of each seed; steps that all share count."""
-    steps = sorted(set.intersection(*map(set, runs)))
-    if not steps:
+    """Figures of a method. runs: {env step: value} of each seed. `steps` are those that all seeds
+    have, and then those of the longer seeds alone; `counts` says how many seeds have them."""
+    shared = sorted(set.intersection(*map(set, runs)))
+    if not shared:
         raise diswm.UserError("the seeds of a method share no evaluation step; name fewer runs")
-    values = np.array([[run[step] for step in steps] for run in runs])  # (seeds, steps)
-    area = np.trapezoid(values, steps) / (steps[-1] - steps[0]) if steps[1:] else values[:, 0]
-    figures = dict(curve=values, final=values[:, -3:].mean(1), area=area)
-    if switch and steps[0] <= switch < steps[-1]:
-        after = np.searchsorted(steps, switch, "right")
+    steps = shared + sorted({step for run in runs for step in run if step > shared[-1]})
+    at = [[run[step] for run in runs if step in run] for step in steps]
+    curve = [mean_interval(np.array(values)) for values in at]
+    values = np.array(at[:len(shared)]).T  # (seeds, shared steps)
+    length = shared[-1] - shared[0]
+    area = np.trapezoid(values, shared) / length if length else values[:, 0]
+    figures = dict(final=values[:, -3:].mean(1), area=area)
+    if switch and shared[0] <= switch < shared[-1]:
+        after = np.searchsorted(shared, switch, "right")
         figures |= dict(before=values[:, after - 1], after=values[:, after])
     figures = {name: mean_interval(values) for name, values in figures.items()}
-    return dict(seeds=len(runs), steps=steps, switch=switch) | figures
+    return dict(seeds=len(runs), steps=steps, counts=[len(values) for values in at], curve=curve,
+                each=runs, switch=switch, final_step=shared[-1]) | figures
 
-def collect_figures(folders):
-    """Runs → {tasks: {method: curve_figures}}"""
-    curves, switches = {}, {}
+def collect_figures(folders, metric="eval_return", by="pair"):
+    """Runs → {panel: {label: curve_figures}}; a panel is a pair of tasks, by src a target."""
+    panels = {}
     for folder in folders:
-        curve, switch = read_run(folder)
-        if curve:
-            tasks, method, _ = folder.resolve().parts[-3:]
-            curves.setdefault(tasks, {}).setdefault(method, []).append(curve)
-            switches[tasks] = switch or switches.get(tasks)
-    if not curves:
-        raise diswm.UserError("no evaluations to plot; run: python diswm.py finetune")
-    return {tasks: {method: curve_figures(runs, switches[tasks])
-                    for method, runs in sorted(methods.items())}
-            for tasks, methods in curves.items()}
+        run = read_run(folder, metric)
+        if not run.curve:
+            print(f"left out: {folder} has no {metric} yet")
+            continue
+        if not run.config:
+            print(f"{folder} has no config.json: its settings are unknown and not compared")
+        panel = run.dst if by == "src" or run.src == run.dst else f"{run.src} → {run.dst}"
+        if by == "src" and run.label.split("+")[0] not in NO_VIDEOS:
+            run.label += f" from {run.src}"
+        panels.setdefault(panel, {}).setdefault(run.label, []).append(run)
+    if not panels:
+        raise diswm.UserError(f"no {metric} to plot; run: python diswm.py finetune")
+    result = {}
+    for panel, labels in tqdm(panels.items(), "intervals", leave=False, disable=None):
+        switch = max(run.switch or 0 for runs in labels.values() for run in runs) or None
+        result[panel] = {}
+        for label, runs in sorted(labels.items()):
+            check_seeds(runs, panel)
+            result[panel][label] = curve_figures([run.curve for run in runs], switch)
+    return result
 
-def draw(result, path):
-    """Draw and print a result of collect_figures: a panel for each pair of tasks."""
+def draw_curve(axes, figures, color, line):
+    """A method: its seeds faintly, their mean, the interval, and where the number of seeds falls.
+    Each stretch of equally many seeds is a line of its own: a mean of fewer is another mean."""
+    counts, steps = figures["counts"], figures["steps"]
+    if figures["seeds"] > 1:
+        for run in figures["each"]:
+            axes.plot(sorted(run), [run[step] for step in sorted(run)], color=color, lw=0.7,
+                      alpha=0.35)
+    for count in sorted(set(counts), reverse=True):
+        part = [i for i, n in enumerate(counts) if n == count]
+        mean, *interval = zip(*(figures["curve"][i] for i in part), strict=True)
+        axes.plot([steps[i] for i in part], mean, color=color, ls=line, marker=".", lw=1.8)
+        if interval:
+            axes.fill_between([steps[i] for i in part], *interval, alpha=0.15, lw=0, color=color)
+        if count < figures["seeds"]:
+            axes.annotate(f"n = {count}", (steps[part[0]], mean[0]), color=color, fontsize=7,
+                          xytext=(2, 5), textcoords="offset points")
+
+def count_seeds(methods):
+    """How many seeds a label has in the panels: "3 seeds", "1 to 3 seeds"."""
+    counts = {figures["seeds"] for figures in methods}
+    low, high = min(counts), max(counts)
+    return (f"{low} to {high}" if low < high else f"{high}") + (" seeds" if high > 1 else " seed")
+
+def draw(result, path, metric="eval_return"):
+    """Draw a result of collect_figures: a panel for each pair of tasks, three in a row."""
     from matplotlib.figure import Figure  # slow to import
-    panels = Figure(figsize=(5.5 * len(result), 3.8)).subplots(1, len(result), squeeze=False)[0]
-    for axes, (tasks, methods) in zip(panels, result.items(), strict=True):
-        for method, figures in methods.items():
-            mean, *interval = figures["curve"]
-            label = f"{method}, {figures['seeds']} seed{'s' if interval else ''}"
-            line, = axes.plot(figures["steps"], mean, marker=".", label=label)
-            if interval:
-                axes.fill_between(figures["steps"], *interval, alpha=0.2, color=line.get_color())
-            print(f"{tasks}: {label}", *(f"{name} {np.round(figures[name], 1).tolist()}"
-                                         for name in ("final", "area", "before", "after")
-                                         if name in figures), sep=", ")
-        if figures["switch"]:
-            axes.axvline(figures["switch"], color="gray", ls=":", label="the colours change")
-        axes.set(title=re.sub(r"-(?!v\d)", " → ", tasks),  # Hopper-v5 has a hyphen of its own
-                 ylim=(min(0, axes.get_ylim()[0]), None),  # the pusher's returns are below 0
-                 xlabel="env steps", ylabel="evaluation return")
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)  # hides no curve
+    from matplotlib.lines import Line2D
+    columns, rows = min(3, len(result)), -(-len(result) // 3)
+    figure = Figure(figsize=(4.4 * columns + 0.6, 3.4 * rows + 0.6), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in panels[len(result):]:
+        axes.remove()
+    handles, switches = [], set()
+    for index, label in enumerate(sorted({label for methods in result.values()
+                                          for label in methods})):
+        color, line = COLORS[index % len(COLORS)], LINES[index // len(COLORS) % len(LINES)]
+        has_it = [methods[label] for methods in result.values() if label in methods]
+        handles.append(Line2D([], [], color=color, ls=line,
+                              label=f"{label}, {count_seeds(has_it)}"))
+        for axes, methods in zip(panels, result.values(), strict=False):
+            if label in methods:
+                draw_curve(axes, methods[label], color, line)
+    for axes, (panel, methods) in zip(panels, result.items(), strict=False):
+        switch = next(iter(methods.values()))["switch"]  # the same for all methods
+        if switch:
+            axes.axvline(switch, color="gray", ls=":")
+            switches.add(switch)
+        axes.set(title=panel, ylim=(min(0, axes.get_ylim()[0]), None),  # the pusher's are below 0
+                 xlabel="env steps", ylabel=AXIS.get(metric, metric))
+        axes.locator_params(axis="x", nbins=6)
         axes.grid(alpha=0.3)
-    axes.figure.savefig(path, dpi=100, bbox_inches="tight")
+    if switches:
+        handles.append(Line2D([], [], color="gray", ls=":", label="the colours change"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, 2 * columns),
+                  title="mean of seeds; band: 95 % bootstrap interval; thin: each seed",
+                  fontsize=8, title_fontsize=8)
+    figure.savefig(path, dpi=200)
+
+def print_table(result):
+    """The figures of a result of collect_figures, a line for each method."""
+    for panel, methods in result.items():
+        for label, figures in methods.items():
+            seeds = f"{figures['seeds']} seed" + "s" * (figures["seeds"] > 1)
+            print(f"{panel}: {label}, {seeds}, at {figures['final_step']:,} env steps",
+                  *(f"{name} {np.round(figures[name], 3 if figures[name][0] < 2 else 1).tolist()}"
+                    for name in ("final", "area", "before", "after") if name in figures), sep=", ")
 
 def main(argv=None):
     parser = diswm.Parser(description=__doc__.split("\n")[0])
     parser.add_argument("run", type=Path, nargs="*", help="their folders; default: all in --runs")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of all runs")
-    parser.add_argument("--out", type=Path, help="PNG to write; default: curves.png in --runs")
+    parser.add_argument("--by", choices=("pair", "src"), default="pair",
+                        help="src: overlay the sources of videos of one target (Fig. 8)")
+    parser.add_argument("--metric", default="eval_return",
+                        help="of the log, such as eval_success (Table B); default: eval_return")
+    parser.add_argument("--out", type=Path,
+                        help=".png, .pdf or .svg to write; default: curves.png in --runs")
     args = parser.parse_args(argv)
     logs = sorted(args.runs.glob("finetune/*/*/seed*/metrics.jsonl"))
-    result, path = collect_figures(args.run or [log.parent for log in logs]), args.out or args.runs
-    path = (path / "curves" if path.is_dir() else path).with_suffix(".png")
+    path = args.out or args.runs / "curves.png"
+    path = path / "curves.png" if path.is_dir() else path
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise diswm.UsageError(f"--out {path}: give a name that ends in .png, .pdf or .svg")
+    folders = args.run or [log.parent for log in logs]
+    result = collect_figures(folders, args.metric, args.by)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draw(result, path)
+    draw(result, path, args.metric)
+    print_table(result)
     path.with_suffix(".json").write_text(json.dumps(result, indent=2) + "\n")
     print(f"wrote {path} and {path.stem}.json")
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (diswm.UserError, OSError) as error:
-        sys.exit("error: " + " ".join(str(error).split()))
+    common.run_script(main)
