@@ -79,7 +79,7 @@ try:
     import mujoco
     importlib.reload(mujoco.gl_context)  # an earlier import did not see MUJOCO_GL
     from dm_control import suite
-except (AttributeError, ImportError, RuntimeError) as error:  # of missing libraries
+except (AttributeError, ImportError, RuntimeError) as error:
     raise OpenGLError(f"error: {GL}: {error}; {GL_REMEDY}") from error
 PROCESS = os.getpid()
 VERSIONS = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
@@ -98,7 +98,7 @@ class Config:
     seed: int = 0  # seed of everything random (ours)
     tag: str = ""  # sets a run of other settings apart (ours)
     runs: str = "runs"  # folder of all runs (ours)
-    teacher: str = ""  # a teacher's checkpoint.pt; empty: the one for --src (ours)
+    teacher: str = ""  # its checkpoint.pt; empty: the one of --src (ours)
     videos: str = ""  # folder of episodes, *.npy; empty: collect's (ours)
     steps: int = 1_000_000  # env steps of finetuning (paper)
     collect_steps: int = 2_000_000  # env steps of collecting: 1M frames (paper)
@@ -110,7 +110,7 @@ class Config:
     colors: str = "published"  # around fixed centres or the original colours (paper)
     color_range: float = 0.2  # half width of a box, RGB in 0..1
     fast_render: bool = False  # no anti-aliasing, twice as fast (ours)
-    camera: str = ""  # one of the task's, by name; empty: one that shows it (ours)
+    camera: str = ""  # by name; empty: one that shows the task (ours)
     # --- acting, and how often to learn
     prefill: int = 2500  # decisions at random before learning
     first_updates: int = 100  # updates right after prefill
@@ -129,7 +129,7 @@ class Config:
     free_nats: float = 1.0  # nats below which the KL is not trained
     grad_clip: float = 100.0  # largest gradient norm of an optimiser
     # --- methods: what makes them
-    encoder: str = "beta_vae"  # image encoder and decoder; conv: DreamerV2's (paper)
+    encoder: str = "beta_vae"  # and decoder; conv: DreamerV2's (paper)
     carry_over: str = "none"  # video weights go into the model, below its RSSM (paper)
     bonus: float = 0.0  # weight of the intrinsic bonus in the reward (APV: 0.1)
     z_dim: int = 20  # size of the β-VAE latent (table)
@@ -175,7 +175,7 @@ LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_
 CHOICES = dict(colors=("published", "original"), encoder=("beta_vae", "conv"),
                carry_over=("none", "weights", "stack"), actor=("squashed", "clipped"),
                device=("auto", "cpu", "cuda"), precision=("auto", "fp32", "bf16"))
-MAY_CHANGE = ("preset", "runs", "teacher", "videos", "device", "precision", "threads",  # of a run
+MAY_CHANGE = ("preset", "runs", "teacher", "videos", "device", "precision", "threads",
               "switch", "steps", "collect_steps", "pretrain_updates", "eval_episodes", "wandb")
 
 def flag_name(name):
@@ -205,7 +205,7 @@ METHODS = dict(  # sets of Config values; all run through the same code
 CHOICES |= dict(preset=PRESETS, method=METHODS)
 
 # === Tasks and distractors (sections 2 and 4) ===
-vars(np).setdefault("in1d", np.isin)  # dropped by NumPy 2.4, called by dm_control
+vars(np).setdefault("in1d", np.isin)  # dm_control's, dropped by NumPy
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS
          if domain != "lqr"}  # whose actions have no bounds
 OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
@@ -345,7 +345,7 @@ def color_groups(task, model):
     return materials + [(model.geom_rgba, [i]) for i in np.flatnonzero(own)]
 
 class DistractingEnv(gym.Wrapper):
-    """A simulator in colours drawn for each episode, by the phase in reset's options."""
+    """A simulator in new colours each episode, by the phase in reset's options."""
     render_mode = "rgb_array"
     spec = property(lambda self: self.unwrapped.spec)  # of make_env
 
@@ -598,7 +598,7 @@ def gaussian_sample(mean, std):
     return mean + std * torch.randn_like(std)
 
 def clip_action(action, limit=1 - 1e-6):
-    """Clip into (−1, 1), gradient straight through: a saturated action can come back."""
+    """Clip into (−1, 1), gradient straight through: it can come back."""
     return action + (action.clamp(-limit, limit) - action).detach()
 
 # === Networks ===
@@ -687,7 +687,7 @@ class BetaVAEDecoder(PerFrame):
         self.apply(kaiming)
 
 class ConvEncoder(PerFrame):
-    """DreamerV2's encoder, for the baselines: image (..., 3, 64, 64) → embed (..., 32 d)."""
+    """DreamerV2's, for the baselines: image (..., 3, 64, 64) → embed (..., 32 d)."""
     def __init__(self, d=32):
         super().__init__(
             3, nn.Conv2d(3, d, 4, 2), ELU,  # 31 × 31
@@ -700,7 +700,7 @@ class ConvEncoder(PerFrame):
         return dict(embed=self(image))
 
 class ConvDecoder(PerFrame):
-    """DreamerV2's decoder, for the baselines: feat (..., S + D) → (..., 3, 64, 64)."""
+    """DreamerV2's, for the baselines: feat (..., S + D) → (..., 3, 64, 64)."""
     def __init__(self, feat_dim, d=32):
         super().__init__(
             1, nn.Linear(feat_dim, 32 * d), nn.Unflatten(-1, (32 * d, 1, 1)),  # 1 × 1
@@ -849,7 +849,7 @@ class VideoPredictor(nn.Module):
 
     def loss(self, out, batch, z_disen=None, eta=0.0):
         """Eq. (2), or (5) for a WorldModel, of the output of forward. Returns (loss, metrics).
-        z_disen: the teacher's latents of the same images, (B, T, Z), if there is one."""
+        z_disen: the teacher's latents, (B, T, Z), if there is one."""
         cfg, post, prior = self.cfg, out["post"], out["prior"]
         terms = {name: loss.mean() for name, loss in self.frame_losses(out, batch).items()}
         terms["kl_loss"], kl = rssm_kl_loss(post, prior, cfg.kl_balance, cfg.free_nats)
@@ -875,7 +875,7 @@ class WorldModel(VideoPredictor):
         """Those of Eq. (2), reward, discount: dict of (B, T). Last rows have no bonus."""
         losses = super().frame_losses(out, batch)
         feat, reward = out["feat"], batch["reward"]
-        # DEVIATION: the discount head of Eq. (4) is trained; the published code has it off.
+        # DEVIATION: published, the discount head of Eq. (4) is off.
         logit, target = self.discount(feat).squeeze(-1), self.cfg.gamma * batch["discount"]
         losses["discount"] = F.binary_cross_entropy_with_logits(logit, target, reduction="none")
         if "bonus" in out:
@@ -907,7 +907,7 @@ class ActorCritic(nn.Module):
 
     def policy(self, feat):
         """The normal that actions come from, by `squash`, (..., A)."""
-        # DEVIATION: published, a normal around tanh(m): ten of ten cartpole runs began stuck.
+        # DEVIATION: published, a normal around tanh(m), which can get stuck.
         mean, std = mean_std(self.actor(feat))
         if self.cfg.actor == "clipped":
             mean = torch.tanh(mean)
@@ -944,7 +944,7 @@ class ActorCritic(nn.Module):
 
     def losses(self, model, start, start_discount):
         """start: dict of (N, ·) detached states; start_discount (N,): their true γ_0. Returns
-        (actor_loss, critic_loss, metrics); the actor's graph runs through the world model."""
+        (actor_loss, critic_loss, metrics); the actor's graph includes the model."""
         cfg = self.cfg
         feats, last, log_prob, entropy = self.imagine(model, start)
         reward = model.reward(feats).squeeze(-1)  # (H, N)
@@ -962,18 +962,15 @@ class ActorCritic(nn.Module):
         objective = (cfg.rho * target + (1 - cfg.rho) * log_prob * advantage
                      + cfg.entropy_scale * entropy)
         actor_loss = -(weight * objective).mean()
-        return actor_loss, critic_loss, self.actor_metrics(feats[0, :64]) | dict(
+        with torch.no_grad():  # is the actor alive, and does it heed the state?
+            policy = self.policy(feats[0, :64])
+            (mode, _), (action, _) = self.squash(policy.mean), self.squash(policy.rsample())
+        return actor_loss, critic_loss, dict(
             actor=actor_loss, critic=critic_loss, actor_entropy=entropy.mean(),
-            value=value.mean(), imagined_reward=reward.mean(), imagined_return=target.mean())
-
-    @torch.no_grad()
-    def actor_metrics(self, feat):
-        """Is the actor alive, and does it heed the state? Of states (N, S + D)."""
-        policy = self.policy(feat)
-        (mode, _), (action, _) = self.squash(policy.mean), self.squash(policy.rsample())
-        return dict(actor_slope=(1 - mode**2).mean(), actor_std=policy.stddev.mean(),
-                    actor_spread=policy.mean.std(0).mean(),  # over states
-                    actor_saturated=(action.abs() > 0.99).float().mean())
+            value=value.mean(), imagined_reward=reward.mean(), imagined_return=target.mean(),
+            actor_slope=(1 - mode**2).mean(), actor_std=policy.stddev.mean(),
+            actor_spread=policy.mean.std(0).mean(),  # over states
+            actor_saturated=(action.abs() > 0.99).float().mean())
 
     @torch.no_grad()
     def value_correlation(self, feats, rows):
@@ -985,7 +982,7 @@ class ActorCritic(nn.Module):
         return torch.corrcoef(torch.stack([value, came]))[0, 1].nan_to_num().item()
 
 # === One update of all of them ===
-def autocast(cfg):  # 1.7× of a whole step at 50 × 50 on a CPU with native bf16
+def autocast(cfg):  # 1.7× of a step at 50 × 50 on a CPU with bf16
     """bf16 for convolutions and MLPs; statistics, GRU state and losses are fp32."""
     return torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16")
 
@@ -1008,7 +1005,7 @@ def descend(loss, optimizer, clip):
     return norm
 
 def check_finite(metrics):
-    """An update's metrics as floats. Raises UserError, before the run saves, at NaN."""
+    """An update's metrics as floats. UserError, before the run saves, at NaN."""
     values = torch.stack([value.detach().float() for value in metrics.values()]).tolist()
     metrics = dict(zip(metrics, values, strict=True))
     bad = [name for name, value in metrics.items() if not math.isfinite(value)]
@@ -1048,7 +1045,7 @@ class Agent(nn.Module):
         return action[0].cpu().numpy(), state
 
     def update(self, batch, eta, index):
-        """Algorithm 1, lines 13–18, with numpy arrays (B, T, ...) → dict of scalar tensors."""
+        """Algorithm 1, lines 13–18, on numpy arrays (B, T, ...) → dict of scalars."""
         cfg, behaviour, z_disen = self.cfg, self.behaviour, None
         batch = to_device(batch, cfg.device)
         with autocast(cfg):
@@ -1074,7 +1071,7 @@ class Agent(nn.Module):
         return metrics | more | dict(actor_grad_norm=actor_norm, critic_grad_norm=critic_norm)
 
 def prepare_machine(cfg):
-    """Decide what is "auto", and set torch up. Returns the Config with the decisions."""
+    """Decide what is "auto", set torch up → the Config with the decisions."""
     device, native = "cpu", torch.cpu.get_capabilities().get("avx512_bf16")
     if cfg.device != "cpu" and torch.cuda.is_available():
         device, native = "cuda", torch.cuda.is_bf16_supported(including_emulation=False)
@@ -1082,7 +1079,7 @@ def prepare_machine(cfg):
         raise UserError("there is no CUDA device; use --device cpu")
     torch.set_num_threads(min(cfg.threads or 1024, len(os.sched_getaffinity(0))))
     libc = ctypes.CDLL(None)
-    libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD; to give large buffers back is 1.9× of a step
+    libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD; giving buffers back: 1.9× of a step
     libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     return replace(cfg, device=device, precision=precision)
@@ -1101,7 +1098,7 @@ def read_checkpoint(path):
         return dict(saved, config=Config(**saved["config"]), log=str(saved["log"]))
 
 class Run:
-    """A run's folder. Colours, η and seeds follow from the counts in `done`, no random state."""
+    """A run's folder. Colours, η and all seeds follow from the counts in `done`."""
     def __init__(self, cfg, stage, fresh=False):
         check_task(cfg.src)
         check_task(cfg.dst)
@@ -1144,7 +1141,7 @@ class Run:
         self.unit, self.total, self.parts, self.shown = unit, total, parts, {}
         begin, self.before = getattr(self.done, unit), self.done.seconds
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.lock = open(self.folder / "lock", "w")  # noqa: SIM115  while the process lives
+        self.lock = open(self.folder / "lock", "w")  # noqa: SIM115
         try:
             fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -1237,7 +1234,7 @@ def train_video_predictor(cfg, run, videos):
             metrics = []
 
 def color_phase(cfg, env_steps):
-    """The phase of an episode that begins then, and the step at which it must end."""
+    """An episode's phase, and the step at which it must end."""
     switch = round(cfg.switch * cfg.steps)  # once, at the midpoint
     return ("train", switch) if env_steps < switch else ("shifted", cfg.steps)
 
@@ -1319,7 +1316,7 @@ def evaluate_agent(cfg, env, agent, phase, explore=False):
 
 # === Stages ===
 def open_run(path, **changes):
-    """A checkpoint → (its Config with changes, its Agent or VideoPredictor, saved)."""
+    """A checkpoint → (Config with changes, Agent or VideoPredictor, saved)."""
     saved = read_checkpoint(path)
     changes = dict(device="auto", precision="fp32", threads=0) | changes
     cfg = prepare_machine(replace(saved["config"], **changes))
@@ -1333,7 +1330,7 @@ def open_run(path, **changes):
     return cfg, model, saved
 
 def finished_run(folder):
-    """The checkpoint of a finished run of any seed, a folder's own first; or None."""
+    """The checkpoint of a finished run, a folder's own seed first; or None."""
     paths = folder / "checkpoint.pt", *sorted(folder.parent.glob("seed*/checkpoint.pt"))
     done = (path for path in paths if path.exists() and read_checkpoint(path)["finished"])
     return next(done, None)
@@ -1395,7 +1392,7 @@ def finetune(cfg, fresh=False, stage="finetune"):
     return run.folder
 
 def evaluate(run, out=None, **changes):
-    """Play a run's policy by mode and by samples, and a random one, to JSON and mp4 (stage 4)."""
+    """Play a run's policy, by mode and by samples, and a random one (stage 4)."""
     cfg, agent, saved = open_run(run / "checkpoint.pt", **changes)
     if not isinstance(agent, Agent):
         raise UserError(f"{run} has no policy; give a finetune run")
@@ -1420,7 +1417,7 @@ def evaluate(run, out=None, **changes):
     return result
 
 # === Figures: traverse and doctor ===
-TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's range, and the published ±9
+TRAVERSAL = (-9, -3, -2, -1, 0, 1, 2, 3, 9)  # the prior's, and published ±9
 FAMILIES = ("walker_walk", "pusher", "drawer_open", "FetchReach-v4", "HalfCheetah-v5")
 
 def to_picture(image):
@@ -1500,7 +1497,7 @@ def traverse(run, out=None, **changes):
     torch.manual_seed(cfg.seed)
     for name, *grid in picture_grids(run, getattr(model, "model", model)):
         draw_grid(*grid, (out or run) / f"{name}.png", f"{title}, step {step:,}")
-        if name == "traversal":  # a frame for each value, of the ten most informative latents
+        if name == "traversal":  # a frame a value, of ten latents
             frames = [join(latents[None, :10]) for latents in grid[0].swapaxes(0, 1)[1:]]
             iio.imwrite((out or run) / "traversal.mp4", np.stack(frames), fps=3)
 
