@@ -2046,7 +2046,7 @@ def test_a_finished_run_continued_does_nothing(copied, tmp_path):
     after = all_files(copied)
     assert {path: after[path] for path in before} == before
     assert {path.name.split(".tfevents")[0] for path in after.keys() - before.keys()} <= {
-        "events.out", "open_loop.png", "traversal.png"}
+        "events.out", "film.png", "open_loop.png", "traversal.png", "traversal.mp4"}
     origin, = map(json.loads, (copied / "provenance.jsonl").read_text().splitlines())
     _, path, *_, digest = origin["teacher"].split()  # --teacher PATH of sha256 …
     assert hashlib.sha256(Path(path).read_bytes()).hexdigest().startswith(digest)
