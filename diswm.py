@@ -1499,7 +1499,8 @@ def traverse(run, out=None, **changes):
         draw_grid(*grid, (out or run) / f"{name}.png", f"{title}, step {step:,}")
         if name == "traversal":  # a frame a value, of ten latents
             frames = [join(latents[None, :10]) for latents in grid[0].swapaxes(0, 1)[1:]]
-            iio.imwrite((out or run) / "traversal.mp4", np.stack(frames), fps=3)
+            iio.imwrite((out or run) / "traversal.mp4", np.stack(frames), fps=3,
+                        macro_block_size=2)  # even sides are enough
 
 def doctor(tasks=FAMILIES):
     """Draw each phase of tasks (Fig. 3), doctor.png, and say what runs here."""
