@@ -1217,8 +1217,9 @@ def train_video_predictor(cfg, run, videos):
     model, done, metrics = VideoPredictor(cfg).to(cfg.device), run.done, []
     optimizer = adam(model, cfg.model_lr)
     run.start("updates", cfg.pretrain_updates, model=model, optimizer=optimizer)
-    if not (run.folder / "episodes").exists():  # one video stays, for `traverse`
-        Replay(run.folder / "episodes").add(videos.read(videos.paths[-1])[-1000:])
+    shown = Replay(run.folder / "episodes")
+    if not shown.paths:  # one video stays with the run, for `traverse`
+        shown.add(videos.read(videos.paths[-1])[-1000:])
     while done.updates < cfg.pretrain_updates:  # 4: for t = 1 … K_1
         rng = np.random.default_rng([cfg.seed, done.updates])
         torch.manual_seed(rng.integers(2**63))  # of all noise

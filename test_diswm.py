@@ -2425,10 +2425,11 @@ def brief(root, tmp_path_factory):
 
 @pytest.mark.parametrize("owner, name, call, spoil", [
     (diswm.Replay, "add", 1, lambda log: None),
+    (diswm, "write_whole", 4, lambda log: None),
     (diswm, "descend", 99, lambda log: log.unlink()),
     (diswm, "descend", 150, lambda log: log.write_bytes(log.read_bytes()[:99])),
     (diswm.Run, "save", 3, lambda log: log.write_bytes(log.read_bytes() + b'{"step": 999}\n'))],
-    ids=["at once", "log lost", "log cut off", "a row too many"])
+    ids=["at once", "at its video", "log lost", "log cut off", "a row too many"])
 def test_pretraining_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
         owner, name, call, spoil, root, brief, tmp_path):
     """Batches and noise follow from an update's number: only weights and Adam need saving. The log
