@@ -2301,6 +2301,15 @@ def readme_commands():
             if re.match(r"python (diswm|results/\w+)\.py\b", line)]
 
 
+def test_the_readmes_lines_load_a_run_and_act(finished, root, monkeypatch):
+    """As they stand there."""
+    lines, = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    monkeypatch.chdir(root)
+    exec(lines, played := {})
+    played["env"].close()
+    assert played["episode"].over and played["episode"].total > 0
+
+
 def test_every_readme_command_runs(workdir):
     """In file order, in one folder, at debug size (also where the README gives a longer one)."""
     commands = readme_commands()
