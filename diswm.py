@@ -597,10 +597,6 @@ def gaussian_sample(mean, std):
     """A reparameterised draw: the gradient reaches mean and std."""
     return mean + std * torch.randn_like(std)
 
-def clip_action(action, limit=1 - 1e-6):
-    """Clip into (−1, 1), gradient straight through: it can come back."""
-    return action + (action.clamp(-limit, limit) - action).detach()
-
 # === Networks ===
 ELU = nn.ELU(inplace=True)  # has no weights; 19 % less memory at 50 × 50
 
@@ -915,8 +911,9 @@ class ActorCritic(nn.Module):
 
     def squash(self, x):
         """A policy's sample or mean → an action in [−1, 1], and ln |da/dx|, (..., A) each"""
-        if self.cfg.actor == "clipped":
-            return clip_action(x), torch.zeros_like(x)
+        if self.cfg.actor == "clipped":  # gradient straight through, so that it can come back
+            clipped = x.clamp(1e-6 - 1, 1 - 1e-6)
+            return x + (clipped - x).detach(), torch.zeros_like(x)
         slope = 2 * (math.log(2) - x - F.softplus(-2 * x))  # ln(1 − tanh² x)
         return torch.tanh(x), slope
 
@@ -1500,8 +1497,7 @@ def traverse(run, out=None, **changes):
         draw_grid(*grid, (out or run) / f"{name}.png", f"{title}, step {step:,}")
         if name == "traversal":  # a frame a value, of ten latents
             frames = [join(latents[None, :10]) for latents in grid[0].swapaxes(0, 1)[1:]]
-            iio.imwrite((out or run) / "traversal.mp4", np.stack(frames), fps=3,
-                        macro_block_size=2)  # even sides are enough
+            iio.imwrite((out or run) / "traversal.mp4", np.stack(frames), fps=3, macro_block_size=2)
 
 def doctor(tasks=FAMILIES):
     """Draw each phase of tasks (Fig. 3), doctor.png, and say what runs here."""
