@@ -135,7 +135,7 @@ class Config:
     z_dim: int = 20  # size of the β-VAE latent (table)
     beta: float = 0.015  # β, weight of the disentanglement loss in Eq. (5) (table)
     beta1: float = 1.0  # β₁, weight of the action-free KL in Eq. (2) (table)
-    beta2: float = 0.015  # β₂, the same in Eq. (2) (table)
+    beta2: float = 0.015  # β₂, weight of the disentanglement loss in Eq. (2) (table)
     # --- distillation, Eq. (3); its clock counts all decisions
     eta: float = 0.1  # η at the start (table)
     eta_end: float = 0.01  # η at the end (paper, section 3.4)
@@ -416,7 +416,8 @@ class DistractingEnv(gym.Wrapper):
         super().close()
 
 def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **settings):
-    """Actions in [−1, 1], uint8 images. time_limit: simulator steps; 0: the task's own."""
+    """Actions in [−1, 1], uint8 images. phase: "shifted" is after the midpoint, "eval" metal for
+    drawers. time_limit: simulator steps; 0: the task's own."""
     check_task(task)
     if os.getpid() != PROCESS:
         raise UserError('OpenGL hangs in a forked process; use context="spawn"')
@@ -432,6 +433,7 @@ for name in (*TASKS, *OTHER_TASKS):
     gym.register(f"DisWM/{name}-v0", f"{__name__}:make_env", kwargs=dict(task=name))
 
 def config_env(cfg, task):
+    """make_env with the values of a Config."""
     names = ("action_repeat", "time_limit", "colors", "color_range", "fast_render", "camera")
     return make_env(task, **{name: getattr(cfg, name) for name in names})
 
@@ -1470,17 +1472,21 @@ def draw_grid(pictures, rows, columns, path, title=""):
     axes.figure.savefig(path, dpi=200, bbox_inches="tight")
     log.info("wrote %s", path)
 
-def picture_grids(run, model):
-    """Of a run's last episode: name, pictures, names of rows, of columns."""
+def last_episode(run, model):
+    """Its rows, and the batch of one window, of 50 rows, with which it begins."""
     actions = model.rssm.action_dim
     replay = Replay(run / "episodes", agent_row(actions) if actions else VIDEO_ROW)
     if not replay.paths:
         raise UserError(f"no episodes in {replay.folder}; nothing to draw from")
     rows = replay.read(replay.paths[-1])
+    batch = {name: np.array(rows[name][:50])[None] for name in replay.dtype.names}
+    return rows, to_device(batch, model.cfg.device)
+
+def picture_grids(run, model):
+    """Of a run's last episode: name, pictures, names of rows, of columns."""
+    rows, batch = last_episode(run, model)
     shown = np.linspace(0, len(rows) - 1, 12).astype(int)
     yield "film", rows["image"][shown][None], [""], shown
-    batch = {name: np.array(rows[name][:50])[None] for name in replay.dtype.names}
-    batch = to_device(batch, model.cfg.device)
     strip = open_loop(model, batch)[:, ::5]
     columns = ["0\nseen", "5\npredicted", *range(10, 50, 5)][:strip.shape[1]]
     yield "open_loop", strip, ("truth", "model", "error"), columns

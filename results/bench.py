@@ -10,8 +10,6 @@ import timeit
 from dataclasses import replace
 
 import common
-import gymnasium as gym
-import mujoco
 import numpy as np
 import torch
 from tqdm import tqdm
@@ -106,9 +104,8 @@ def time_simulator(cfg, task):
 
 def bench(cfg, repeats, tasks):
     """All figures of a Config, as a dict."""
-    versions = {m.__name__: m.__version__ for m in (torch, mujoco, gym, np)}
     result = dict(device=cfg.device, precision=cfg.precision, threads=torch.get_num_threads(),
-                  versions=versions | dict(python=sys.version.split()[0]))
+                  versions=diswm.VERSIONS | dict(python=sys.version.split()[0]))
     result |= {name: getattr(cfg, name) for name in ("method", "batch_size", "batch_length")}
     with diswm.config_env(cfg, cfg.dst) as env:
         agent = diswm.Agent(cfg, *env.action_space.shape)

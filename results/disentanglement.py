@@ -104,7 +104,7 @@ def measure(run, frames=2000, **changes):
         raise diswm.UserError(f"{run} has no β-VAE latents to measure")
     if frames < 8:
         raise diswm.UserError(f"{frames} frames are too few to measure anything")
-    batch = common.last_window(run, model)
+    _, batch = diswm.last_episode(run, model)
     images, factors, names = labelled_frames(cfg, frames)
     encoders = dict(teacher=teacher, start=encoder_at_start(saved, action_dim), end=model.encoder)
     result = dict(task=cfg.dst, factors=names)
