@@ -18,10 +18,12 @@ import diswm
 
 
 def median_s(function, repeats, device="cpu"):
-    """Median time of a call, after one to warm up; on a GPU by its own clock."""
+    """Median time of a call, after one to warm up; on a GPU by its own clock, after five, as the
+    fourth records a graph."""
     if device == "cpu":
         return float(np.median(timeit.repeat(function, number=1, repeat=repeats + 1)[1:]))
-    function()
+    for _ in range(5):
+        function()
     marks = [torch.cuda.Event(enable_timing=True) for _ in range(repeats + 1)]
     marks[0].record()
     for mark in marks[1:]:
@@ -31,47 +33,45 @@ def median_s(function, repeats, device="cpu"):
     return float(np.median([a.elapsed_time(b) for a, b in itertools.pairwise(marks)])) / 1e3
 
 def time_updates(cfg, agent, folder, repeats):
-    """Seconds of the updates, and of a batch; the peak memory of an online run; the update."""
-    rng, rows = np.random.default_rng(0), diswm.agent_row(agent.action_dim)
+    """Seconds of the updates, and of a batch; the peak memory of an online run."""
+    rows, rng = diswm.agent_row(agent.action_dim), np.random.default_rng(0)
     noise = np.zeros(max(1000, cfg.batch_length), rows)
     noise["image"] = rng.integers(0, 256, noise["image"].shape, np.uint8)
     diswm.Replay(folder, rows).add(noise)
     del noise  # 12 MB of the peak
-    replay = diswm.Replay(folder, rows)
+    replay = diswm.Replay(folder, rows, cfg.device)
 
     def sample():
-        return replay.sample(cfg.batch_size, cfg.batch_length, rng)
+        return replay.sample(cfg.batch_size, cfg.batch_length, rng.integers(2**32))
 
     def time(function, repeats=repeats):
         return median_s(function, repeats, cfg.device)
 
     data = sample()
-
-    def agent_update():
-        return agent.update(data, cfg.eta, 1)
-
-    result = dict(train_step_s=time(agent_update))
+    numbers = dict(eta=cfg.eta, index=1)
+    result = dict(train_step_s=time(lambda: agent.update(data | numbers)))
     result["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     result["sample_ms"] = 1e3 * time(sample, 20)
     frames = {name: data[name] for name in diswm.VIDEO_ROW.names}
     video = diswm.VideoPredictor(cfg).to(cfg.device)
     optimizer = diswm.adam(video, cfg.model_lr)
 
-    def pretraining_update():  # as in diswm.train_video_predictor
-        batch = diswm.to_device(frames, cfg.device)
-        with diswm.autocast(cfg):
+    def update(batch):  # as in diswm.train_video_predictor
+        batch = diswm.to_device(batch, cfg.device)
+        with torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16"):
             loss, metrics = video.loss(video(batch), batch)
         return metrics | dict(norm=diswm.descend(loss, optimizer, cfg.grad_clip))
 
-    result["pretrain_step_s"] = time(pretraining_update)
-    return result, agent_update
+    update = diswm.Graphed(update, cfg.device)
+    result["pretrain_step_s"] = time(lambda: update(frames))
+    return result
 
-def measure_gpu(cfg, update):
+def measure_gpu(cfg, agent):
     """What only a GPU has: name, memory, kernels of an update; env steps/s of a short run."""
     result = dict(card=torch.cuda.get_device_name(),
                   gpu_memory_mb=torch.cuda.max_memory_allocated() / 2**20)
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
-        update()
+        agent.update.function(agent.update.inputs)  # not its graph
         torch.cuda.synchronize()
     on_gpu = torch.autograd.DeviceType.CUDA
     result["kernels"] = sum(event.device_type == on_gpu for event in profile.events())
@@ -110,10 +110,9 @@ def bench(cfg, repeats, tasks):
     with diswm.config_env(cfg, cfg.dst) as env:
         agent = diswm.Agent(cfg, *env.action_space.shape)
     with tempfile.TemporaryDirectory() as folder:
-        times, update = time_updates(cfg, agent, folder, max(1, repeats))
-    result |= times
+        result |= time_updates(cfg, agent, folder, max(1, repeats))
     if cfg.device == "cuda":
-        result |= measure_gpu(cfg, update)
+        result |= measure_gpu(cfg, agent)
     result |= dict(params=count_parameters(agent), frame_ms={}, decision_ms={})
     for task in tqdm(tasks, "simulators", leave=False, disable=None):
         result["frame_ms"][task], result["decision_ms"][task] = time_simulator(cfg, task)
@@ -124,7 +123,7 @@ def estimate(cfg):
     with diswm.config_env(cfg, cfg.dst) as env:
         agent = diswm.Agent(cfg, *env.action_space.shape)
     with tempfile.TemporaryDirectory() as folder:
-        times, _ = time_updates(cfg, agent, folder, 1)
+        times = time_updates(cfg, agent, folder, 1)
     decision, batch = time_simulator(cfg, cfg.dst)[1] / 1e3, times["sample_ms"] / 1e3
 
     def online(steps, evaluation=500):  # decisions of an episode

@@ -104,15 +104,16 @@ def measure(run, frames=2000, **changes):
         raise diswm.UserError(f"{run} has no β-VAE latents to measure")
     if frames < 8:
         raise diswm.UserError(f"{frames} frames are too few to measure anything")
-    _, batch = diswm.last_episode(run, model)
+    batch = common.first_window(run, model)
     images, factors, names = labelled_frames(cfg, frames)
     encoders = dict(teacher=teacher, start=encoder_at_start(saved, action_dim), end=model.encoder)
     result = dict(task=cfg.dst, factors=names)
     for name, encoder in encoders.items():
         if encoder:
             encoder = encoder.to(cfg.device)
-            codes = torch.cat([encoder.encode(diswm.preprocess(part.to(cfg.device)))["mean"].cpu()
-                               for part in torch.from_numpy(images).split(100)])
+            parts = (diswm.to_device(dict(image=part), cfg.device) for part in
+                     torch.from_numpy(images).split(100))
+            codes = torch.cat([encoder.encode(part["image"])["mean"].cpu() for part in parts])
             scores, share = disentanglement(codes.numpy(), factors)
             result[name] = scores | dict(share=share.tolist())
             print(f"{name:8}", *(f"{key} {value:.3f}" for key, value in scores.items()), sep="  ")

@@ -109,7 +109,7 @@ def report(run):
     pair = cfg.dst if cfg.src == cfg.dst else f"{cfg.src} → {cfg.dst}"
     title = f"{pair}, {cfg.method}, seed {cfg.seed}, {saved['stage']}, {step}"
     write_film(run)
-    sections, (_, batch) = [], diswm.last_episode(run, model)
+    sections, batch = [], common.first_window(run, model)
     if learning_curve(run):
         sections.append(section("Learning curve", "", image_tag(run / "curve.png")))
     torch.manual_seed(cfg.seed)

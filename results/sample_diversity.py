@@ -35,7 +35,7 @@ def draw_clips(folder, count, length, rng):
 @torch.no_grad()
 def clip_latents(encoder, clips, device):
     """Each clip's latents, the encoder's means of all its frames in a row: (N, T · Z)."""
-    rows = [encoder.encode(diswm.preprocess(torch.from_numpy(clip).to(device)))["mean"].flatten()
+    rows = [encoder.encode(diswm.to_device(dict(image=clip), device)["image"])["mean"].flatten()
             for clip in tqdm(clips, desc="clips", leave=False, disable=None)]
     return torch.stack(rows).float().cpu().numpy()
 
