@@ -16,11 +16,11 @@ name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
 print(name.replace(" ", "_"))')
 
 echo "(a) graph and plain calls"
-timeout 90 $python results/gpu/compare.py "${preset:-paper}" 2>&1 | tee "$OUT/graph.txt"
+timeout 120 $python results/gpu/compare.py "${preset:-paper}" 2>&1 | tee "$OUT/graph.txt"
 
 echo "(b) bench"
 for size in ${preset:-paper small}; do
-    timeout 60 $python results/bench.py --preset "$size" --tasks walker_walk --json >"$OUT/$card-$size.json" && cat "$OUT/$card-$size.json"
+    timeout 75 $python results/bench.py --preset "$size" --tasks walker_walk --json >"$OUT/$card-$size.json" && cat "$OUT/$card-$size.json"
 done
 
 echo "(c) yardstick, in what is left of 570 seconds"
