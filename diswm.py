@@ -210,7 +210,7 @@ vars(np).setdefault("in1d", np.isin)  # dm_control's, dropped by NumPy
 TASKS = {f"{domain}_{task}": (domain, task) for domain, task in suite.ALL_TASKS
          if domain != "lqr"}  # whose actions have no bounds
 OTHER_TASKS = dict(pusher="pusher", drawer_open="drawer", drawer_close="drawer")
-PHASES = ("train", "shifted", "eval", "none")  # shifted: later; eval: metal; none: its own
+PHASES = ("train", "shifted", "eval", "none")  # half 1, half 2, on metal, the task's own colours
 # DEVIATION: as published; the paper says around the original ones.
 COLOR_CENTERS = dict(train=(0.7, 0.3, 0.5), shifted=(0.5, 0.7, 0.3), eval=(0.5, 0.7, 0.3))
 

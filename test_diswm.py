@@ -1252,6 +1252,23 @@ def test_a_pretraining_recorded_once_and_replayed_is_the_same(root, as_on_a_gpu,
     torch.testing.assert_close(*weights, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_update_and_decision_make_no_tensor_on_another_device(method, monkeypatch):
+    """On PyTorch's meta device, whose tensors have no values to read and mix with no other's."""
+    monkeypatch.setattr(diswm, "adam", lambda module, lr: torch.optim.Adam(module.parameters()))
+    monkeypatch.setattr(torch, "autocast", lambda *args, **kwargs: contextlib.nullcontext())
+    cfg = tiny_config(method, imagine_starts=9)
+    object.__setattr__(cfg, "device", "meta")  # no choice of --device
+    agent, batch = make_agent(cfg), fake_batch() | dict(eta=0.1, index=0)
+    agent.update.function(batch)
+    row = {key: value[0, :1] for key, value in batch.items() if key in ("image", "action")}
+    state = agent.decide.function(row | dict(explore=True) | agent.model.rssm.initial(1))
+    assert {x.device.type for x in state.values()} == {"meta"}
+    monkeypatch.setattr(Normal, "rsample", lambda self: self.mean + torch.randn(self.mean.shape))
+    with pytest.raises(RuntimeError, match="device"):
+        agent.update.function(batch)
+
+
 @pytest.mark.parametrize("actions", [0, 2])
 def test_a_gru_cell_is_one_piece_for_the_compiler(actions, monkeypatch):
     """On a GPU torch.compile gets it: no break, for windows, imagination and acting."""
