@@ -1176,8 +1176,8 @@ class Run:
             row = dict(begin=begin, commit=git.read().strip(), machine=os.uname(), **VERSIONS)
             with open(self.folder / "provenance.jsonl", "a") as file:
                 file.write(json.dumps(row | self.inputs) + "\n")
-        log.info(f"{self.folder}, at {begin:,} of {total:,} {unit}, on {self.cfg.device} with "
-                 f"{self.cfg.precision}")
+        log.info(f"{self.folder}, preset {self.cfg.preset}, at {begin:,} of {total:,} {unit}, "
+                 f"on {self.cfg.device} with {self.cfg.precision}")
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
         self.bar._time = time.monotonic  # clocks may be set back
@@ -1580,8 +1580,8 @@ def main(argv=None):
         given, defaults = parse_args(sys.argv[1:] if argv is None else argv)
         command = globals()[given.pop("command")]
         if "fresh" in given:
-            log.info("preset %s", defaults.preset)
-            given = dict(fresh=given.pop("fresh"), cfg=prepare_machine(replace(defaults, **given)))
+            fresh = given.pop("fresh")
+            given = dict(cfg=prepare_machine(replace(defaults, **given)), fresh=fresh)
         command(**given)
         return 0
     except UserError as error:
