@@ -1088,9 +1088,9 @@ class Agent(nn.Module):
 
 def prepare_machine(cfg):
     """Decide what is "auto", set torch up → the Config with the decisions."""
-    device, native = "cpu", torch.cpu.get_capabilities().get("avx512_bf16")
-    if cfg.device != "cpu" and torch.cuda.is_available():
-        device, native = "cuda", torch.cuda.is_bf16_supported(including_emulation=False)
+    device = "cuda" if cfg.device != "cpu" and torch.cuda.is_available() else "cpu"
+    native = (torch.cuda.is_bf16_supported(including_emulation=False) if device == "cuda"
+              else torch.cpu.get_capabilities().get("avx512_bf16"))
     if cfg.device not in ("auto", device):
         raise UserError("there is no CUDA device; use --device cpu")
     torch.set_num_threads(min(cfg.threads or 1024, len(os.sched_getaffinity(0))))
@@ -1099,7 +1099,7 @@ def prepare_machine(cfg):
     libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     if device == "cuda":
-        torch.set_float32_matmul_precision("high" if precision == "bf16" else "highest")  # TF32
+        torch.set_float32_matmul_precision("high")  # TF32
         torch.cuda.set_stream(torch.cuda.Stream())  # no graph is recorded on the default one
     return replace(cfg, device=device, precision=precision)
 

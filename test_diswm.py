@@ -1252,6 +1252,25 @@ def test_a_pretraining_recorded_once_and_replayed_is_the_same(root, as_on_a_gpu,
     torch.testing.assert_close(*weights, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("native, device, expected", [
+    (True, "auto", ("cuda", "bf16")), (False, "cuda", ("cuda", "fp32")), (True, "cpu", ("cpu",))])
+def test_a_gpu_is_taken_where_there_is_one_and_an_old_one_computes_in_fp32(
+        native, device, expected, monkeypatch):
+    """TF32 where it can; graphs want a stream of their own. The CPU's abilities do not matter, and
+    older PyTorch cannot tell them."""
+    called = []
+    for name, answer in dict(is_available=True, is_bf16_supported=native, Stream="a stream",
+                             set_stream=None).items():
+        monkeypatch.setattr(torch.cuda, name, lambda *args, name=name, answer=answer, **kwargs: (
+            called.append((name, *args)) or answer))
+    monkeypatch.setattr(torch, "set_float32_matmul_precision", lambda *args: called.append(args))
+    if expected[0] == "cuda":
+        monkeypatch.delattr(torch.cpu, "get_capabilities")
+    cfg = diswm.prepare_machine(Config(device=device, threads=torch.get_num_threads()))
+    assert (cfg.device, cfg.precision)[:len(expected)] == expected
+    assert (("set_stream", "a stream") in called) == (("high",) in called) == (cfg.device == "cuda")
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_update_and_decision_make_no_tensor_on_another_device(method, monkeypatch):
     """On PyTorch's meta device, whose tensors have no values to read and mix with no other's."""
