@@ -58,7 +58,7 @@ def time_updates(cfg, agent, folder, repeats):
 
     def update(batch):  # as in diswm.train_video_predictor
         batch = diswm.to_device(batch, cfg.device)
-        with torch.autocast(cfg.device, torch.bfloat16, enabled=cfg.precision == "bf16"):
+        with video.autocast:
             loss, metrics = video.loss(video(batch), batch)
         return metrics | dict(norm=diswm.descend(loss, optimizer, cfg.grad_clip))
 
