@@ -185,11 +185,11 @@ def flag_name(name):
 
 PRESETS = {
     "paper": Config(),
-    # Smaller batches want a larger model_lr. η grows by 50 / 32: Eq. (3) sums over time.
+    # Smaller batches want larger rates. η grows by 50 / 32: Eq. (3) sums over time.
     "small": Config(
-        preset="small", steps=100_000, collect_steps=20_000, pretrain_updates=1_000,
+        preset="small", steps=100_000, collect_steps=20_000, pretrain_updates=1_000, cnn_depth=16,
         fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
-        cnn_depth=16, model_lr=1e-3, eta=0.156, eta_end=0.0156, eta_decay=5_000),
+        model_lr=1e-3, actor_lr=2e-4, critic_lr=2e-4, eta=0.156, eta_end=0.0156, eta_decay=5_000),
     "debug": Config(  # seconds, for tests: nothing is learnt
         preset="debug", steps=300, collect_steps=200, pretrain_updates=20, prefill=50,
         first_updates=2, threads=1, train_every=10, eval_every=100, eval_episodes=2,
