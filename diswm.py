@@ -196,12 +196,11 @@ PRESETS = {
         time_limit=50, batch_size=3, batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12,
         hidden=10, units=10, eta=0.6, eta_end=0.06, eta_decay=60, slow_every=5),
 }
-NO_DISTILL, NO_BETA = dict(eta=0.0, eta_end=0.0), dict(beta=0.0, beta2=0.0)
 # DEVIATION: Gaussian latents in all methods; those of DreamerV2 and APV were discrete.
-DV2 = NO_DISTILL | NO_BETA | dict(encoder="conv", carry_over="none", bonus=0.0)
+DV2 = dict(eta=0.0, eta_end=0.0, beta=0.0, beta2=0.0, encoder="conv", carry_over="none", bonus=0.0)
 METHODS = dict(  # sets of Config values; all run through the same code
-    diswm={}, no_distill=NO_DISTILL, no_disentangle=NO_BETA, dreamerv2=DV2,
-    dv2_finetune=DV2 | dict(carry_over="weights"),
+    diswm={}, no_distill=dict(eta=0.0, eta_end=0.0), no_disentangle=dict(beta=0.0, beta2=0.0),
+    dreamerv2=DV2, dv2_finetune=DV2 | dict(carry_over="weights"),
     apv=DV2 | dict(carry_over="stack", bonus=0.1))
 CHOICES |= dict(preset=PRESETS, method=METHODS)
 
@@ -618,8 +617,7 @@ class PerFrame(nn.Module):
         self.dims, self.net = dims, nn.Sequential(*layers)
 
     def forward(self, x):
-        y = self.net(x.flatten(0, -1 - self.dims))
-        return y.float().unflatten(0, x.shape[:-self.dims])
+        return self.net(x.flatten(0, -1 - self.dims)).float().unflatten(0, x.shape[:-self.dims])
 
 def mlp(inputs, units, layers, outputs=1):
     """`layers` hidden layers with ELU, then a linear one: (..., inputs) → (..., outputs)."""
@@ -640,10 +638,15 @@ class BiasGradient(torch.autograd.Function):
         return grad, grad.sum((0, 2, 3))
 
 class Deconvolution(nn.ConvTranspose2d):
-    """Its own backward sums the bias's gradient slowly."""
+    """The same in less time: 13 to 17 % of an update of DreamerV2."""
     def forward(self, x):
-        y = F.conv_transpose2d(x, self.weight, self.bias.detach(), self.stride, self.padding)
-        return BiasGradient.apply(y, self.bias)
+        if x.shape[-1] == 1:  # of one pixel it is a matrix product
+            return torch.einsum("nixy,iohw->nohw", x, self.weight) + self.bias[:, None, None]
+        odd = self.kernel_size[0] % 2  # kernels of odd size are slow; with zeros they are even
+        weight = F.pad(self.weight, (0, odd, 0, odd))
+        y = F.conv_transpose2d(x, weight, self.bias.detach(), self.stride, self.padding)
+        y = BiasGradient.apply(y, self.bias)
+        return y[..., :-1, :-1] if odd else y
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → 𝐳 (..., Z)."""
@@ -775,8 +778,7 @@ class StackedRSSM(RSSM):
     def step(self, state, action, embed, keep):
         stoch, deter = state["below"].split([self.sizes["stoch"], self.sizes["deter"]], -1)
         below = self.feat(self.below.step(dict(stoch=stoch, deter=deter), None, embed, keep))
-        seen = torch.cat([embed, below], -1)
-        return super().step(state, action, seen, keep) | dict(below=below)
+        return super().step(state, action, torch.cat([embed, below], -1), keep) | dict(below=below)
 
 class IntrinsicBonus(nn.Module):
     """APV's reward for the unusual: mean distance to the k nearest of late states."""
@@ -807,12 +809,10 @@ class VideoPredictor(nn.Module):
         bf16 = cfg.precision == "bf16"  # of convolutions and MLPs: 1.7× of a step at 50 × 50
         self.autocast = torch.autocast(cfg.device, torch.bfloat16, bf16)
         if cfg.encoder == "beta_vae":
-            embed_dim = cfg.z_dim
-            self.encoder = BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth)
+            self.encoder, embed_dim = BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth), cfg.z_dim
             self.decoder = BetaVAEDecoder(self.feat_dim, cfg.z_dim, cfg.cnn_depth)
         else:
-            embed_dim = 32 * cfg.cnn_depth
-            self.encoder = ConvEncoder(cfg.cnn_depth)
+            self.encoder, embed_dim = ConvEncoder(cfg.cnn_depth), 32 * cfg.cnn_depth
             self.decoder = ConvDecoder(self.feat_dim, cfg.cnn_depth)
         self.decoder.to(memory_format=torch.channels_last)  # with Deconvolution 12 % of a step
         rssm = StackedRSSM if cfg.carry_over == "stack" and action_dim else RSSM

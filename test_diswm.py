@@ -779,6 +779,22 @@ def test_the_terms_are_the_negative_log_likelihoods_of_equations_4_and_5():
         torch.testing.assert_close(terms[name], oracle, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("form", [(4, 2, 1), (5, 2), (6, 2), (4, 1)])  # kernel, stride, padding
+@given(seeds, sizes, sizes, sizes, sizes)
+def test_a_deconvolution_is_pytorchs_and_has_its_gradients(form, seed, n, inputs, outputs, size):
+    """Whichever way it goes: of one pixel, by a kernel of odd size, or neither; then an ELU."""
+    torch.manual_seed(seed)
+    size += len(form) == 3  # ours does not pad a single pixel
+    x, results = randn(seed, n, inputs, size, size), []
+    layer = torch.nn.ConvTranspose2d(inputs, outputs, *form).double()
+    for kind in torch.nn.ConvTranspose2d, diswm.Deconvolution:
+        net = torch.nn.Sequential(kind(inputs, outputs, *form).double(), torch.nn.ELU(inplace=True))
+        net[0].load_state_dict(layer.state_dict())
+        y = net(start := leaf(x))
+        results.append([y, *torch.autograd.grad((y**2).sum(), [start, *net.parameters()])])
+    torch.testing.assert_close(*results)
+
+
 @pytest.mark.parametrize("kind, actions", [("VideoPredictor", 0), ("WorldModel", 2)])
 def test_one_batch_again_and_again_is_learnt(kind, actions):
     """Each image becomes known: the error falls far below that of the images' mean."""
