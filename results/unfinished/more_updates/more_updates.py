@@ -1,5 +1,6 @@
-"""more_updates.py RUN UPDATES: go on updating a finished run without new data. Prints, every 1 000
-updates, the returns of 10 episodes, by mode and by samples, and the metrics."""
+"""more_updates.py RUN UPDATES [PARTS [RATE]]: go on updating a finished run without new data, all
+of it or, of "model actor critic", some PARTS; at another learning RATE of actor and critic. Prints,
+every 500 updates, the returns of 10 episodes, by mode and by samples, and the metrics."""
 
 import json
 import sys
@@ -14,10 +15,15 @@ run, count, rows = Path(sys.argv[1]), int(sys.argv[2]), []
 cfg, agent, saved = diswm.open_run(run / "checkpoint.pt", precision="auto", threads=1)
 for name, optimizer in agent.optimizers.items():
     optimizer.load_state_dict(saved[name])
+    group = optimizer.param_groups[0]
+    if len(sys.argv) > 3 and name not in sys.argv[3].split():
+        group["lr"] = 0.0
+    elif len(sys.argv) > 4 and name != "model":
+        group["lr"] = float(sys.argv[4])
 replay = diswm.Replay(run / "episodes", diswm.agent_row(agent.action_dim))
 env, first = diswm.config_env(cfg, cfg.dst), saved["done"]["updates"]
 for index in range(first, first + count + 1):
-    if (index - first) % 1000 == 0:
+    if (index - first) % 500 == 0:
         mode, sampled = (diswm.evaluate_agent(cfg, env, agent, "train", explore)[0]
                          for explore in (False, True))
         row = dict(extra=index - first, ret=mode["return"], std=mode["std"],
