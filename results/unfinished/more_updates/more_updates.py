@@ -1,6 +1,6 @@
-"""more_updates.py RUN UPDATES [PARTS [RATE]]: go on updating a finished run without new data, all
-of it or, of "model actor critic", some PARTS; at another learning RATE of actor and critic. Prints,
-every 500 updates, the returns of 10 episodes, by mode and by samples, and the metrics."""
+"""more_updates.py RUN UPDATES [PART=RATE …]: go on updating a finished run without new data, with
+other learning rates of model, actor or critic (0: as it is). Prints, every 500 updates, the returns
+of 10 episodes, by mode and by samples, and the metrics."""
 
 import json
 import sys
@@ -12,14 +12,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 import diswm  # noqa: E402
 
 run, count, rows = Path(sys.argv[1]), int(sys.argv[2]), []
+rates = dict(word.split("=") for word in sys.argv[3:])
 cfg, agent, saved = diswm.open_run(run / "checkpoint.pt", precision="auto", threads=1)
 for name, optimizer in agent.optimizers.items():
     optimizer.load_state_dict(saved[name])
-    group = optimizer.param_groups[0]
-    if len(sys.argv) > 3 and name not in sys.argv[3].split():
-        group["lr"] = 0.0
-    elif len(sys.argv) > 4 and name != "model":
-        group["lr"] = float(sys.argv[4])
+    optimizer.param_groups[0]["lr"] = float(rates.get(name, optimizer.param_groups[0]["lr"]))
 replay = diswm.Replay(run / "episodes", diswm.agent_row(agent.action_dim))
 env, first = diswm.config_env(cfg, cfg.dst), saved["done"]["updates"]
 for index in range(first, first + count + 1):
