@@ -2978,6 +2978,16 @@ def test_area_final_and_switch_figures_are_those_worked_out_by_hand():
         figures([{10: 1}, {20: 1}])
 
 
+def test_methods_are_compared_seed_by_seed_at_the_steps_that_both_have():
+    """Methods that each vary by 90 between seeds may differ by 5 in every one."""
+    differences = script("plot").paired_differences
+    ours = dict(seed0={10: 5, 20: 95}, seed1={10: 6, 20: 5, 30: 9}, seed7={10: 0})
+    theirs = dict(seed0={10: 1, 20: 90, 30: 9}, seed1={10: 0, 20: 0}, seed2={10: 0})
+    assert differences(ours, theirs, switch=10) == dict(
+        final=[5, 4.5, 5.5], area=[5, 4.5, 5.5], before=[5, 4, 6], after=[5, 5, 5])
+    assert differences(ours, dict(seed1=theirs["seed1"])) == {}  # no interval of one difference
+
+
 def test_plot_draws_the_published_figures_from_the_published_logs(tmp_path, monkeypatch, capsys):
     """Evaluations count for when they were due; ids keep their hyphen; −300 is in the picture."""
     from matplotlib.axes import Axes

@@ -4,7 +4,8 @@ A run is a folder …/<tasks>/<method>/seed<k> with a metrics.jsonl. Runs whose 
 all but the seed are the seeds of one curve. Beside the picture, and on the terminal, are figures:
 final (mean of the last three evaluations up to final_step, the last that all seeds have), area
 (under the curve up to there, by its length in env steps), before and after (the evaluations around
-the change of colours). Each is [mean, low, high] over the seeds, or [mean] of one seed.
+the change of colours). Each is [mean, low, high] over the seeds, or [mean] of one seed. `minus` has
+the same of the differences to other methods, seed by seed.
 """
 
 import json
@@ -22,6 +23,7 @@ import diswm
 COLORS = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000"
 LINES = "-", "--", ":"
 NO_VIDEOS = "dreamerv2", "no_distill"  # methods for which the source does not matter
+FIGURES = "final", "area", "before", "after"
 AXIS = dict(eval_return="evaluation return", eval_success="success rate")
 
 
@@ -104,6 +106,14 @@ def curve_figures(runs, switch=None):
     return dict(seeds=len(runs), steps=steps, counts=[len(values) for values in at], curve=curve,
                 each=runs, switch=switch, final_step=shared[-1]) | figures
 
+def paired_differences(ours, theirs, switch=None):
+    """Figures of what a method has more than another, seed by seed: {} unless they share two seeds.
+    ours, theirs: {seed: {env step: value}}."""
+    gaps = [{step: value - theirs[seed][step] for step, value in ours[seed].items()
+             if step in theirs[seed]} for seed in sorted(ours.keys() & theirs.keys())]
+    figures = curve_figures(gaps, switch) if len(gaps) > 1 else {}
+    return {name: figures[name] for name in FIGURES if name in figures}
+
 def collect_figures(folders, metric="eval_return", by="pair"):
     """Runs → {panel: {label: curve_figures}}; a panel is a pair of tasks, by src a target."""
     panels = {}
@@ -123,10 +133,16 @@ def collect_figures(folders, metric="eval_return", by="pair"):
     result = {}
     for panel, labels in tqdm(panels.items(), "intervals", leave=False, disable=None):
         switch = max(run.switch or 0 for runs in labels.values() for run in runs) or None
-        result[panel] = {}
+        curves, result[panel] = {}, {}
         for label, runs in sorted(labels.items()):
             check_seeds(runs, panel)
-            result[panel][label] = curve_figures([run.curve for run in runs], switch)
+            curves[label] = {run.seed: run.curve for run in runs}
+        for label, ours in curves.items():
+            figures = curve_figures([*ours.values()], switch)
+            minus = {other: paired_differences(ours, theirs, switch)
+                     for other, theirs in curves.items() if other > label}  # each pair once
+            minus = {other: gaps for other, gaps in minus.items() if gaps}
+            result[panel][label] = figures | dict(minus=minus)
     return result
 
 def draw_curve(axes, figures, color, line):
@@ -188,14 +204,21 @@ def draw(result, path, metric="eval_return"):
                   fontsize=8, title_fontsize=8)
     figure.savefig(path, dpi=200)
 
+def rounded(values):
+    """Success rates to three decimals, returns to one."""
+    return np.round(values, 3 if max(map(abs, values)) < 2 else 1).tolist()
+
 def print_table(result):
     """The figures of a result of collect_figures, a line for each method."""
     for panel, methods in result.items():
         for label, figures in methods.items():
             seeds = f"{figures['seeds']} seed" + "s" * (figures["seeds"] > 1)
             print(f"{panel}: {label}, {seeds}, at {figures['final_step']:,} env steps",
-                  *(f"{name} {np.round(figures[name], 3 if figures[name][0] < 2 else 1).tolist()}"
-                    for name in ("final", "area", "before", "after") if name in figures), sep=", ")
+                  *(f"{name} {rounded(figures[name])}" for name in FIGURES if name in figures),
+                  sep=", ")
+            for other, gaps in figures["minus"].items():
+                print(f"    minus {other}, seed by seed",
+                      *(f"{name} {rounded(gap)}" for name, gap in gaps.items()), sep=", ")
 
 def main(argv=None):
     parser = diswm.Parser(description=__doc__.split("\n")[0])
