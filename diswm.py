@@ -196,12 +196,12 @@ PRESETS = {
         time_limit=50, batch_size=3, batch_length=8, horizon=3, cnn_depth=4, stoch=6, deter=12,
         hidden=10, units=10, eta=0.6, eta_end=0.06, eta_decay=60, slow_every=5),
 }
+NO_DISTILL, NO_BETA = dict(eta=0.0, eta_end=0.0), dict(beta=0.0, beta2=0.0)
 # DEVIATION: Gaussian latents in all methods; those of DreamerV2 and APV were discrete.
-DV2 = dict(eta=0.0, eta_end=0.0, beta=0.0, beta2=0.0, encoder="conv", carry_over="none", bonus=0.0)
+DV2 = NO_DISTILL | NO_BETA | dict(encoder="conv", carry_over="none", bonus=0.0)
 METHODS = dict(  # sets of Config values; all run through the same code
-    diswm={}, no_distill=dict(eta=0.0, eta_end=0.0), no_disentangle=dict(beta=0.0, beta2=0.0),
-    dreamerv2=DV2, dv2_finetune=DV2 | dict(carry_over="weights"),
-    apv=DV2 | dict(carry_over="stack", bonus=0.1))
+    diswm={}, no_distill=NO_DISTILL, no_disentangle=NO_BETA, dreamerv2=DV2,
+    dv2_finetune=DV2 | dict(carry_over="weights"), apv=DV2 | dict(carry_over="stack", bonus=0.1))
 CHOICES |= dict(preset=PRESETS, method=METHODS)
 
 # === Tasks and distractors (sections 2 and 4) ===
@@ -640,13 +640,13 @@ class BiasGradient(torch.autograd.Function):
 class Deconvolution(nn.ConvTranspose2d):
     """The same in less time: 16 % of an update of `small` DreamerV2."""
     def forward(self, x):
-        if x.shape[-1] == 1:  # of one pixel it is a matrix product
+        if x.shape[-1] == 1:  # of one pixel, unpadded, it is a matrix product
             return torch.einsum("nixy,iohw->nohw", x, self.weight) + self.bias[:, None, None]
         odd = self.kernel_size[0] % 2  # kernels of odd size are slow; with zeros they are even
         weight = F.pad(self.weight, (0, odd, 0, odd))
         y = F.conv_transpose2d(x, weight, self.bias.detach(), self.stride, self.padding)
-        y = BiasGradient.apply(y, self.bias)
-        return y[..., :-1, :-1].clone() if odd else y
+        y = BiasGradient.apply(y, self.bias)  # PyTorch sums this one slowly
+        return y[..., :-1, :-1].clone() if odd else y  # ELU's gradient is slow on a view
 
 class BetaVAEEncoder(PerFrame):
     """β-VAE encoder of Eqs. (1), (4): image (..., 3, 64, 64) → 𝐳 (..., Z)."""
