@@ -2997,14 +2997,14 @@ def test_plot_draws_the_published_figures_from_the_published_logs(tmp_path, monk
     (tmp_path / "a-Hopper-v5/diswm/seed0").mkdir(parents=True)
     (tmp_path / "a-Hopper-v5/diswm/seed0/metrics.jsonl").write_text(
         '{"step": 23, "eval_step": 20, "eval_return": 5, "phase": "train"}\n')
-    runs = [*tmp_path.glob("*/*/seed0"), *sorted(LABORATORY.glob("*-*/*/seed*"))]
+    runs = [*tmp_path.glob("*/*/seed0"), *sorted(LABORATORY.glob("former_actor/*/*/seed*"))]
     script("plot").main([*map(str, runs), "--out", str(tmp_path)])
     found = json.loads((tmp_path / "curves.json").read_text())
     assert found["a → Hopper-v5"]["diswm"]["steps"] == [20]
     for pair in ("cheetah_run-walker_walk", "finger_spin-cartpole_swingup"):
         panel = pair.replace("-", " → ")
-        published = json.loads((LABORATORY / f"{pair}.json").read_text())[panel]
-        assert published.keys() == {name for name in found[panel] if "+" not in name}
+        published = json.loads((LABORATORY / f"former_actor/{pair}.json").read_text())[panel]
+        assert published.keys() == found[panel].keys()
         for method in published:
             figures = found[panel][method]
             for name, value in figures.items():

@@ -86,22 +86,28 @@ def mean_interval(values):
         estimates += found.confidence_interval
     return [estimate.tolist() for estimate in estimates]
 
-def curve_figures(runs, switch=None):
-    """Figures of a method. runs: {env step: value} of each seed. `steps` are those that all seeds
-    have, and then those of the longer seeds alone; `counts` says how many seeds have them."""
+def seed_figures(runs, switch=None):
+    """The figures of each seed. runs: {env step: value} of each → the steps that all have, and
+    arrays (seeds,) by name."""
     shared = sorted(set.intersection(*map(set, runs)))
     if not shared:
         raise diswm.UserError("the seeds of a method share no evaluation step; name fewer runs")
-    steps = shared + sorted({step for run in runs for step in run if step > shared[-1]})
-    at = [[run[step] for run in runs if step in run] for step in steps]
-    curve = [mean_interval(np.array(values)) for values in at]
-    values = np.array(at[:len(shared)]).T  # (seeds, shared steps)
+    values = np.array([[run[step] for step in shared] for run in runs])
     length = shared[-1] - shared[0]
     area = np.trapezoid(values, shared) / length if length else values[:, 0]
     figures = dict(final=values[:, -3:].mean(1), area=area)
     if switch and shared[0] <= switch < shared[-1]:
         after = np.searchsorted(shared, switch, "right")
         figures |= dict(before=values[:, after - 1], after=values[:, after])
+    return shared, figures
+
+def curve_figures(runs, switch=None):
+    """A method's curve and figures. runs: {env step: value} of each seed. `steps` are those that
+    all seeds have, and then those of the longer seeds alone; `counts` says how many have them."""
+    shared, figures = seed_figures(runs, switch)
+    steps = shared + sorted({step for run in runs for step in run if step > shared[-1]})
+    at = [[run[step] for run in runs if step in run] for step in steps]
+    curve = [mean_interval(np.array(values)) for values in at]
     figures = {name: mean_interval(values) for name, values in figures.items()}
     return dict(seeds=len(runs), steps=steps, counts=[len(values) for values in at], curve=curve,
                 each=runs, switch=switch, final_step=shared[-1]) | figures
@@ -111,8 +117,9 @@ def paired_differences(ours, theirs, switch=None):
     ours, theirs: {seed: {env step: value}}."""
     gaps = [{step: value - theirs[seed][step] for step, value in ours[seed].items()
              if step in theirs[seed]} for seed in sorted(ours.keys() & theirs.keys())]
-    figures = curve_figures(gaps, switch) if len(gaps) > 1 else {}
-    return {name: figures[name] for name in FIGURES if name in figures}
+    if len(gaps) < 2:
+        return {}
+    return {name: mean_interval(values) for name, values in seed_figures(gaps, switch)[1].items()}
 
 def collect_figures(folders, metric="eval_return", by="pair"):
     """Runs → {panel: {label: curve_figures}}; a panel is a pair of tasks, by src a target."""
