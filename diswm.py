@@ -71,7 +71,7 @@ def reading(path, kind, remedy="start over with --fresh"):
     try:
         yield
     except Exception as error:
-        if type(error) in (UserError, MemoryError):  # not a Config's
+        if type(error) in (UserError, MemoryError):  # but a Config's UsageError is wrapped
             raise
         cause = f"{type(error).__name__}: {error}".split("\n")[0][:120]
         raise UserError(f"{path} is no {kind} ({cause}); {remedy}") from error
@@ -113,7 +113,7 @@ class Config:
     fast_render: bool = False  # no anti-aliasing, twice as fast (ours)
     camera: str = ""  # by name; empty: one that shows the task (ours)
     # --- acting, and how often to learn
-    prefill: int = 2500  # decisions at random before learning
+    prefill: int = 2500  # decisions at random before learning, at least: whole episodes
     first_updates: int = 100  # updates right after prefill
     train_every: int = 5  # decisions per update
     eval_every: int = 10_000  # env steps between evaluations
@@ -131,7 +131,7 @@ class Config:
     grad_clip: float = 100.0  # largest gradient norm of an optimiser
     # --- methods: what makes them
     encoder: str = "beta_vae"  # and decoder; conv: DreamerV2's (paper)
-    carry_over: str = "none"  # video weights go into the model, below its RSSM (paper)
+    carry_over: str = "none"  # the video model's weights start the model's, or lie below it (paper)
     bonus: float = 0.0  # weight of the intrinsic bonus in the reward (APV: 0.1)
     z_dim: int = 20  # size of the β-VAE latent (table)
     beta: float = 0.015  # β, weight of the disentanglement loss in Eq. (5) (table)
@@ -163,7 +163,7 @@ class Config:
     wandb: str = ""  # project to log to as well, after: pip install wandb (ours)
 
     def __post_init__(self):
-        """Refuse values that cannot be meant."""
+        """Refuse values that are unknown or too low."""
         for name, value in vars(self).items():
             if name in CHOICES and value not in CHOICES[name]:
                 raise UsageError(f"{flag_name(name)} {value}: not of {', '.join(CHOICES[name])}")
@@ -185,11 +185,11 @@ def flag_name(name):
 
 PRESETS = {
     "paper": Config(),
-    # Smaller batches want larger rates. η grows by 50 / 32: Eq. (3) sums over time.
+    # Smaller batches want larger rates. Eq. (3) sums over 32 rows, not 50; η also falls in prefill.
     "small": Config(
         preset="small", steps=100_000, collect_steps=20_000, pretrain_updates=1_000, cnn_depth=16,
         fast_render=True, batch_size=16, batch_length=32, imagine_starts=256, units=200,
-        model_lr=1e-3, actor_lr=2e-4, critic_lr=2e-4, eta=0.156, eta_end=0.0156, eta_decay=5_000),
+        model_lr=1e-3, actor_lr=2e-4, critic_lr=2e-4, eta=0.156, eta_end=0.0156, eta_decay=7_500),
     "debug": Config(  # seconds, for tests: nothing is learnt
         preset="debug", steps=300, collect_steps=200, pretrain_updates=20, prefill=50,
         first_updates=2, threads=1, train_every=10, eval_every=100, eval_episodes=2,
@@ -425,13 +425,13 @@ def make_env(task, *, phase="train", seed=0, time_limit=0, render_mode=None, **s
     env.reset(seed=seed)
     return env
 
+ENVIRONMENT = ("action_repeat", "time_limit", "colors", "color_range", "fast_render", "camera")
 for name in (*TASKS, *OTHER_TASKS):
     gym.register(f"DisWM/{name}-v0", f"{__name__}:make_env", kwargs=dict(task=name))
 
 def config_env(cfg, task):
     """make_env with the values of a Config."""
-    names = ("action_repeat", "time_limit", "colors", "color_range", "fast_render", "camera")
-    return make_env(task, **{name: getattr(cfg, name) for name in names})
+    return make_env(task, **{name: getattr(cfg, name) for name in ENVIRONMENT})
 
 # === Episodes and the replay buffer ===
 VIDEO_ROW = np.dtype([("image", np.uint8, (64, 64, 3)), ("is_first", np.bool_)])
@@ -569,8 +569,8 @@ def rssm_kl_loss(post, prior, balance=0.8, free_nats=1.0):
     sg_q, sg_p = (Normal(x.mean.detach(), x.stddev.detach()) for x in (q, p))
     prior_side = kl_divergence(sg_q, p).sum(-1)  # (B, T), trains p
     value = kl_divergence(q, sg_p).sum(-1)  # (B, T), trains q
-    loss = balance * prior_side.mean().clamp(min=free_nats)
-    return loss + (1 - balance) * value.mean().clamp(min=free_nats), value
+    prior_loss, post_loss = (kl.mean().clamp(min=free_nats) for kl in (prior_side, value))
+    return balance * prior_loss + (1 - balance) * post_loss, value
 
 def distillation_loss(z_disen, z_task):
     """Latent distillation, Eq. (3): KL(z_disen || z_task) = Σ z_disen · ln(z_disen / z_task).
@@ -585,7 +585,7 @@ def eta_schedule(step, start=0.1, end=0.01, decay_steps=50_000, delay=0):
     on a line that would reach 0 at delay + decay_steps."""
     if step < delay:
         return 0.0
-    return max(start * (1 - (step - delay) / decay_steps), min(start, end))
+    return max(start * (1 - (step - delay) / decay_steps), min(start, end))  # never above start
 
 def lambda_return(reward, value, discount, bootstrap, lambda_=0.95):
     """λ-target V_t (appendix B), the actor's objective and the critic's regression target.
@@ -756,7 +756,7 @@ class RSSM(nn.Module):
             action = action * keep
         return self.posterior(self.recur(state, action), embed)
 
-    @torch.autocast("cuda", enabled=False)  # so many small products: casts cost more than they save
+    @torch.autocast("cuda", enabled=False)  # there, casts cost more than they save
     def observe(self, embed, action, is_first):
         """Filter windows: (B, T, Z), (B, T, A) or None, (B, T) → post, prior: (B, T, ·) each."""
         state, states = self.initial(len(embed)), []
@@ -781,7 +781,7 @@ class StackedRSSM(RSSM):
         return super().step(state, action, torch.cat([embed, below], -1), keep) | dict(below=below)
 
 class IntrinsicBonus(nn.Module):
-    """APV's reward for the unusual: mean distance to the k nearest of late states."""
+    """APV's reward for the unusual: mean distance to the k nearest of recent states."""
     def __init__(self, feat_dim, k=16, window=5, size=4096, dims=128, momentum=0.99):
         super().__init__()
         self.k, self.window, self.momentum = k, window, momentum
@@ -806,7 +806,7 @@ class VideoPredictor(nn.Module):
     def __init__(self, cfg, action_dim=0):
         super().__init__()
         self.cfg, self.feat_dim = cfg, cfg.stoch + cfg.deter
-        bf16 = cfg.precision == "bf16"  # of convolutions and MLPs: 1.7× of a step at 50 × 50
+        bf16 = cfg.precision == "bf16"  # of convolutions and MLPs; at 50 × 50 fp32 takes 1.7×
         self.autocast = torch.autocast(cfg.device, torch.bfloat16, bf16)
         if cfg.encoder == "beta_vae":
             self.encoder, embed_dim = BetaVAEEncoder(cfg.z_dim, cfg.cnn_depth), cfg.z_dim
@@ -848,7 +848,7 @@ class VideoPredictor(nn.Module):
         if z_disen is not None:
             terms["distill"] = distillation_loss(z_disen, out["code"]["embed"])
         loss = sum(weights[name] * term for name, term in terms.items())
-        return loss, terms | dict(kl=kl.mean())
+        return loss, {name: x.detach() for name, x in terms.items()} | dict(kl=kl.mean().detach())
 
 # === World model, Eqs. (4) and (5) ===
 class WorldModel(VideoPredictor):
@@ -862,7 +862,7 @@ class WorldModel(VideoPredictor):
         self.bonus = IntrinsicBonus(self.feat_dim) if cfg.bonus else None
 
     def frame_losses(self, out, batch):
-        """Those of Eq. (2), reward, discount: dict of (B, T). Last rows have no bonus."""
+        """Those of Eq. (2), reward, discount: (B, T). With a bonus the last rows lack a reward."""
         losses = super().frame_losses(out, batch)
         feat, reward = out["feat"], batch["reward"]
         # DEVIATION: published, the discount head of Eq. (4) is off.
@@ -879,10 +879,10 @@ class WorldModel(VideoPredictor):
         """Take over a VideoPredictor's weights (in a stack, the RSSM's go below)."""
         # DEVIATION: it saw no actions. Zeros are as good, and train no input weights.
         for part in ("encoder", "decoder", "rssm"):
-            own = getattr(self, part)
-            own = getattr(own, "below", own).state_dict()  # it shares the weights' memory
+            module = getattr(self, part)
+            weights = getattr(module, "below", module).state_dict()  # it shares their memory
             for name, value in getattr(video, part).state_dict().items():
-                own[name][..., :value.shape[-1]] = value  # actions' input weights stay
+                weights[name][..., :value.shape[-1]] = value  # actions' input weights stay
 
 # === Actor-critic: behaviour in imagination, appendix B ===
 class ActorCritic(nn.Module):
@@ -909,8 +909,8 @@ class ActorCritic(nn.Module):
         if self.cfg.actor == "clipped":  # gradient straight through, so that it can come back
             clipped = x.clamp(1e-6 - 1, 1 - 1e-6)
             return x + (clipped - x).detach(), torch.zeros_like(x)
-        slope = 2 * (math.log(2) - x - F.softplus(-2 * x))  # ln(1 − tanh² x)
-        return torch.tanh(x), slope
+        log_slope = 2 * (math.log(2) - x - F.softplus(-2 * x))  # ln(1 − tanh² x)
+        return torch.tanh(x), log_slope
 
     @torch.autocast("cuda", enabled=False)  # as in RSSM.observe
     def imagine(self, model, start):
@@ -926,14 +926,14 @@ class ActorCritic(nn.Module):
             # Its gradient comes from where the action leads, not from the state it sees.
             policy = self.policy(feats[-1].detach())
             x = policy.rsample()
-            action, slope = self.squash(x)
-            draws.append((policy.mean, policy.stddev, x, slope))
+            action, log_slope = self.squash(x)
+            draws.append((policy.mean, policy.stddev, x, log_slope))
             state = model.rssm.prior(model.rssm.recur(state, action))
             feats.append(model.rssm.feat(state))
         last = feats.pop()
-        mean, std, x, slope = (torch.stack(values) for values in zip(*draws, strict=True))
-        log_prob = (Normal(mean, std).log_prob(x.detach()) - slope.detach()).sum(-1)
-        return torch.stack(feats), last, log_prob, (Normal(mean, std).entropy() + slope).sum(-1)
+        mean, std, x, log_slope = (torch.stack(values) for values in zip(*draws, strict=True))
+        log_prob = (Normal(mean, std).log_prob(x.detach()) - log_slope.detach()).sum(-1)
+        return torch.stack(feats), last, log_prob, (Normal(mean, std).entropy() + log_slope).sum(-1)
 
     def losses(self, model, start, start_discount):
         """From N detached states, (N, ·), and their true γ_0: actor_loss, critic_loss, metrics"""
@@ -961,12 +961,12 @@ class ActorCritic(nn.Module):
             actor=actor_loss, critic=critic_loss, actor_entropy=entropy.mean(),
             value=value.mean(), imagined_reward=reward.mean(), imagined_return=target.mean(),
             actor_slope=(1 - mode**2).mean(), actor_std=policy.stddev.mean(),
-            actor_spread=policy.mean.std(0).mean(),  # over states
+            actor_spread=policy.mean.std(0, correction=0).mean(),  # over states
             actor_saturated=(action.abs() > 0.99).float().mean())
 
     @torch.no_grad()
     def value_correlation(self, feats, rows):
-        """Of v(s_t) with the discounted return that came, over an episode's rows."""
+        """Of v(s_t) with the discounted return that came, over an episode's rows but the last."""
         value = self.critic(torch.cat(feats)).squeeze(-1)  # (T,)
         reward, discount = value.new_tensor([(x["reward"], x["discount"]) for x in rows]).T
         came = lambda_return(reward, value, self.cfg.gamma * discount, value[-1], lambda_=1.0)
@@ -1049,7 +1049,7 @@ class Agent(nn.Module):
         return state.pop("action")[0].nan_to_num().cpu().numpy(), state  # the log tells of NaN
 
     def decide(self, inputs):
-        """The part of `act` on the device → dict of the state and the action, (1, A)."""
+        """`act` on the device, Graphed → dict of the state and the action, (1, A)."""
         rssm, inputs = self.model.rssm, to_device(inputs, self.cfg.device)
         embed = self.model.encoder.encode(inputs["image"])["embed"]
         state = rssm.step(inputs, inputs["action"], embed, 1)
@@ -1058,7 +1058,7 @@ class Agent(nn.Module):
         return state | dict(action=self.behaviour.squash(sample)[0])
 
     def update(self, batch):
-        """Algorithm 1, lines 13–18. batch: arrays (B, T, ...), eta and index → dict of scalars."""
+        """Algorithm 1, 13–18, Graphed. batch: arrays (B, T, ...), eta, index → dict of scalars."""
         cfg, behaviour, z_disen = self.cfg, self.behaviour, None
         batch = to_device(batch, cfg.device)
         with self.model.autocast:
@@ -1070,21 +1070,19 @@ class Agent(nn.Module):
             loss, metrics = self.model.loss(out, batch, z_disen, batch["eta"])  # 14, 15: Eq. (5)
         metrics["model_grad_norm"] = descend(loss, self.optimizers["model"], cfg.grad_clip)
         start = {name: x.detach().flatten(0, 1) for name, x in out["post"].items()}  # (N, ·)
-        start["discount"] = cfg.gamma * batch["discount"].flatten()
+        discount = cfg.gamma * batch["discount"].flatten()
         if cfg.imagine_starts:
-            chosen = torch.rand_like(start["discount"]).argsort()[:cfg.imagine_starts]
-            start = {name: x[chosen] for name, x in start.items()}
+            chosen = torch.rand_like(discount).argsort()[:cfg.imagine_starts]
+            start, discount = {name: x[chosen] for name, x in start.items()}, discount[chosen]
         due = (batch["index"] % cfg.slow_every == 0).float()
         slow = behaviour.slow_critic.state_dict()  # it shares the weights' memory
         for name, value in behaviour.critic.state_dict().items():
             slow[name].lerp_(value, due)
         with self.model.autocast:
-            actor_loss, critic_loss, more = behaviour.losses(  # 16: imagine
-                self.model, start, start.pop("discount"))
-        actor_norm = descend(actor_loss, self.optimizers["actor"], cfg.grad_clip)  # 18
-        critic_norm = descend(critic_loss, self.optimizers["critic"], cfg.grad_clip)  # 17
-        metrics |= more | dict(actor_grad_norm=actor_norm, critic_grad_norm=critic_norm)
-        return {name: value.detach() for name, value in metrics.items()} | dict(eta=batch["eta"])
+            actor_loss, critic_loss, more = behaviour.losses(self.model, start, discount)  # 16
+        metrics["critic_grad_norm"] = descend(critic_loss, self.optimizers["critic"], cfg.grad_clip)
+        metrics["actor_grad_norm"] = descend(actor_loss, self.optimizers["actor"], cfg.grad_clip)
+        return {name: x.detach() for name, x in (metrics | more).items()} | dict(eta=batch["eta"])
 
 def prepare_machine(cfg):
     """Decide what is "auto", set torch up → the Config with the decisions."""
@@ -1095,7 +1093,7 @@ def prepare_machine(cfg):
         raise UserError("there is no CUDA device; use --device cpu")
     torch.set_num_threads(min(cfg.threads or 1024, len(os.sched_getaffinity(0))))
     libc = ctypes.CDLL(None)
-    libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD; giving buffers back: 1.9× of a step
+    libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD; to give buffers back takes 1.9×
     libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD
     precision = cfg.precision.replace("auto", "bf16" if native else "fp32")
     if device == "cuda":
@@ -1117,7 +1115,7 @@ def read_checkpoint(path):
         return dict(saved, config=Config(**saved["config"]), log=str(saved["log"]))
 
 class Run:
-    """A run's folder. Colours, η and all seeds follow from the counts in `done`."""
+    """A run's folder. Colours, η and all seeds follow from `seed` and the counts in `done`."""
     def __init__(self, cfg, stage, fresh=False):
         check_task(cfg.src)
         check_task(cfg.dst)
@@ -1137,8 +1135,8 @@ class Run:
             if differ:
                 raise UserError(f"{self.folder} was started with other flags: add "
                                 f"{', '.join(differ)}, or --fresh, or another --tag")
-            switch, moved = (color_phase(c, -1)[1] for c in (self.saved["config"], cfg))
-            if switch != moved and min(switch, moved) < self.done.env_steps:
+            switch, moved = (round(c.switch * c.steps) for c in (self.saved["config"], cfg))
+            if switch != moved and min(switch, moved) + cfg.action_repeat <= self.done.env_steps:
                 raise UserError(f"{self.folder} changes colours at step {switch}: "
                                 f"add --switch {switch / cfg.steps}")
 
@@ -1219,7 +1217,7 @@ class Run:
 # === Algorithm 1 ===
 def derived_seed(seed, purpose, index):
     """A seed of its own for each purpose and index."""
-    # DEVIATION: published, colours and weights are unseeded.
+    # DEVIATION: published, colours are unseeded, as are weights.
     number = ("finetune", "evaluate", "pretrain", "collect").index(purpose)
     return int(np.random.SeedSequence([seed, number, index]).generate_state(1)[0])
 
@@ -1260,11 +1258,11 @@ def current_eta(cfg, decisions):
 
 def train_agent(cfg, run, env, agent):
     """Algorithm 1, lines 9–26 (numbers on the right): act, and learn."""
-    replay = Replay(run.folder / "episodes", agent_row(agent.action_dim), cfg.device)
-    done = run.done
-    if replay.paths and not (run.resumes or run.fresh):
+    folder, done = run.folder / "episodes", run.done
+    if any(folder.glob("*.npy")) and not (run.resumes or run.fresh):
         raise UserError(f"{run.folder} has no checkpoint; start over with --fresh")
     run.start("env_steps", cfg.steps, agent=agent, **agent.optimizers)
+    replay = Replay(folder, agent_row(agent.action_dim), cfg.device)
     replay.keep(done.episodes)
     if cfg.steps < (cfg.prefill + cfg.train_every) * cfg.action_repeat:
         log.info("warning: --steps end before an update, after --prefill %d", cfg.prefill)
@@ -1296,7 +1294,7 @@ def train_agent(cfg, run, env, agent):
         if metrics:
             row |= mean_metrics(metrics)
             row["value_correlation"] = agent.behaviour.value_correlation(feats, episode.rows[:-1])
-        due = done.env_steps - done.env_steps % cfg.eval_every
+        due = done.env_steps - done.env_steps % cfg.eval_every  # new if the episode passed it
         if due > began or done.env_steps >= cfg.steps:
             result, _ = evaluate_agent(cfg, env, agent, phase)
             row |= {f"eval_{name}": value for name, value in result.items()}
@@ -1341,11 +1339,12 @@ def open_run(path, **changes):
         model.load_state_dict(saved[name])
     return cfg, model, saved
 
-def finished_run(folder):
-    """The checkpoint of a finished run, a folder's own seed first; or None."""
-    paths = folder / "checkpoint.pt", *sorted(folder.parent.glob("seed*/checkpoint.pt"))
-    done = (path for path in paths if path.exists() and read_checkpoint(path)["finished"])
-    return next(done, None)
+def finished_run(folder, same=()):
+    """The checkpoint of a finished run with the same values, its own seed first; or None."""
+    for path in (folder / "checkpoint.pt", *sorted(folder.parent.glob("seed*/checkpoint.pt"))):
+        saved = read_checkpoint(path) if path.exists() else dict(finished=False)
+        if saved["finished"] and vars(saved["config"]).items() >= dict(same).items():
+            return path
 
 def find_teacher(cfg):
     """--teacher, or a finished pretraining → its path, its model"""
@@ -1354,13 +1353,13 @@ def find_teacher(cfg):
                f"--seed {cfg.seed} --runs {cfg.runs}, with the same --preset")
     if not path:
         raise UserError(f"no teacher of {cfg.src} in {cfg.runs}; {command}")
-    own, video, saved = open_run(path, device=cfg.device, threads=cfg.threads)
+    old, video, saved = open_run(path, device=cfg.device, threads=cfg.threads)
     if saved["stage"] != "pretrain" or not saved["finished"]:
         raise UserError(f"{path} is no finished pretraining; {command}")
     sizes = () if cfg.carry_over == "none" else ("stoch", "deter", "hidden")
     for name in ("src", "encoder", "z_dim", "cnn_depth", *sizes):
-        if getattr(own, name) != getattr(cfg, name):
-            raise UserError(f"{path} does not fit; add {flag_name(name)} {getattr(own, name)}")
+        if getattr(old, name) != getattr(cfg, name):
+            raise UserError(f"{path} does not fit; add {flag_name(name)} {getattr(old, name)}")
     return path, video
 
 def collect(cfg, fresh=False):
@@ -1376,7 +1375,8 @@ def pretrain(cfg, fresh=False):
     run = Run(cfg, "pretrain", fresh)
     folder = cfg.videos
     if not folder:
-        found = finished_run(run_folder(replace(cfg, method="dreamerv2", tag=""), "collect"))
+        collected = run_folder(replace(cfg, method="dreamerv2", tag=""), "collect")
+        found = finished_run(collected, {name: getattr(cfg, name) for name in ENVIRONMENT})
         folder = (found.parent if found else collect(cfg)) / "episodes"
     videos = Replay(folder, device=cfg.device)
     if videos.bounds[-1] < cfg.batch_length:
@@ -1410,9 +1410,8 @@ def evaluate(run, out=None, **changes):
         raise UserError(f"{run} has no policy; give a finetune run")
     out = out or run
     out.mkdir(parents=True, exist_ok=True)
-    step = saved["done"]["env_steps"]
-    phase, _ = color_phase(cfg, min(step, cfg.steps - 1))  # as in training
-    result = dict(task=cfg.dst, step=step)
+    result = dict(task=cfg.dst, step=saved["done"]["env_steps"])
+    phase, _ = color_phase(cfg, min(result["step"], cfg.steps - 1))  # that of the next episode
     with config_env(cfg, cfg.dst) as env:
         for prefix, policy in (("random_", None), ("sampled_", agent), ("", agent)):
             played, episode = evaluate_agent(cfg, env, policy, phase, explore=prefix != "")
@@ -1476,6 +1475,7 @@ def draw_grid(pictures, rows, columns, path, title=""):
     axes.set(title=title, frame_on=False, yticks=range(33, len(picture), 66), yticklabels=rows,
              xticks=range(33, picture.shape[1], 66), xticklabels=columns)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     axes.figure.savefig(path, dpi=200, bbox_inches="tight")
     log.info("wrote %s", path)
 
