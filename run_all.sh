@@ -223,9 +223,11 @@ import diswm
 
 try:
     for line in sys.stdin:
-        given, _ = diswm.parse_args(["finetune", *line.split()[1:]])
-        diswm.check_task(given["src"])
-        diswm.check_task(given["dst"])
+        given, defaults = diswm.parse_args(["finetune", *line.split()[1:]])
+        del given["command"], given["fresh"]
+        cfg = diswm.replace(defaults, **given)
+        diswm.check_task(cfg.src)
+        diswm.check_task(cfg.dst)
 except diswm.UserError as error:
     print(f"error: {error}", file=sys.stderr)
     sys.exit(2)'
@@ -269,12 +271,12 @@ list_commands() {  # those of one source must wait for each other, so they share
 }
 
 finetune_into_log() {  # RUN [FLAGS]
-    local run=$1 code=0
-    mkdir -p "$run"
-    echo "started   $run, which writes console.log"
-    diswm finetune "${@:2}" >>"$run/console.log" 2>&1 || code=$?
+    local run=$1 log=$1.log code=0  # beside the run, which a start from nothing clears
+    mkdir -p "${run%/*}"
+    echo "started   $run, which writes $log"
+    diswm finetune "${@:2}" >>"$log" 2>&1 || code=$?
     if [[ $code != 0 ]]; then
-        echo "error: $run stopped with exit code $code: $(tail -n 1 "$run/console.log")" >&2
+        echo "error: $run stopped with exit code $code: $(tail -n 1 "$log")" >&2
         return "$code"
     fi
     echo "finished  $run"
@@ -307,23 +309,18 @@ finetune_all() {
 }
 
 show_results() {
-    local pair training run logs=() targets="" by=pair
+    local training run plot=(results/plot.py --out "$runs/curves.png" --by pair)
+    if [[ -n $(printf '%s\n' $pairs | sed 's/.*://' | sort | uniq -d) ]]; then
+        plot[4]=src  # a target of several sources: Fig. 8
+    fi
     for training in "${trainings[@]}"; do
         run=${training%% *}
         diswm evaluate --run "$run"
         diswm traverse --run "$run"
+        plot+=("$run")
     done
-    shopt -s nullglob  # a pair may have no run of its own: methods without videos
-    for pair in $pairs; do
-        logs+=("$runs/finetune/${pair/:/-}"/*/seed*/)
-        targets+="${pair#*:}"$'\n'
-    done
-    shopt -u nullglob
-    if [[ -n $(sort <<<"$targets" | uniq -d) ]]; then  # a target of several sources: Fig. 8
-        by=src
-    fi
-    echo "\$ python results/plot.py --by $by ${logs[*]}"
-    .venv/bin/python results/plot.py --by "$by" --out "$runs/curves.png" "${logs[@]}"
+    echo "\$ python ${plot[*]}"
+    .venv/bin/python "${plot[@]}"
 
     echo
     echo "Done in $((SECONDS / 60)) minutes. In $PWD:"

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import diswm  # noqa: E402
@@ -22,10 +23,13 @@ def first_window(run, model):
 
 def run_script(main):
     """Run a script's main as its command line does."""
+    sys.stdout.reconfigure(errors="backslashreplace")  # a Latin-1 terminal has no β
     try:
         main()
     except diswm.UserError as error:
         print("error:", " ".join(str(error).split()), file=sys.stderr)
         sys.exit(2 if isinstance(error, diswm.UsageError) else 1)
-    except OSError as error:
-        sys.exit(f"error: {error}")
+    except (ImportError, OSError, torch.OutOfMemoryError) as error:
+        sys.exit(f"error: {error}".split("\n")[0])
+    except KeyboardInterrupt:
+        sys.exit(130)

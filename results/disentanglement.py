@@ -31,9 +31,9 @@ def paint(env, colors):
     return env.render()
 
 def labelled_frames(cfg, count):
-    """Random episodes of `cfg.dst` in colours that are drawn anew for each frame, from both phases'
-    boxes. Returns images, uint8 (N, 64, 64, 3), factors (N, K): colours that show, joint
-    positions, m, and angles, rad, in (−π, π]; and their names."""
+    """Random episodes of `cfg.dst` in colours that are drawn anew for each frame, from the box
+    around both phases'. Returns images, uint8 (N, 64, 64, 3), factors (N, K): colours that show,
+    joint positions, m, and angles, rad, in (−π, π]; and their names."""
     images, factors, over, rng = [], [], (), np.random.default_rng(cfg.seed)
     with diswm.config_env(cfg, cfg.dst) as env:
         model, data = env.unwrapped.model, env.unwrapped.data

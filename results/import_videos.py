@@ -10,6 +10,7 @@ A long video becomes several files of 1000 frames each, of which only one is in 
 """
 
 import argparse
+import glob
 import io
 import re
 from pathlib import Path
@@ -38,14 +39,14 @@ def to_frame(picture, crop=False):
     """A picture (H, W), (H, W, C) or (C, H, W) → uint8 (64, 64, 3)."""
     if picture.ndim == 3 and picture.shape[-1] not in (1, 3, 4):
         picture = np.moveaxis(picture, 0, -1)
+    if picture.ndim == 3 and picture.shape[-1] not in (1, 3, 4):
+        raise ValueError(f"one of its pictures has {picture.shape[1]} channels")
     if picture.dtype.kind == "f":
         if not (picture.min() >= 0 and picture.max() <= 1):  # nor NaN
             raise ValueError(f"its floats are in [{picture.min():.3g}, {picture.max():.3g}]")
         picture = np.round(picture * 255)
     elif picture.dtype == bool:
         picture = picture * 255
-    elif picture.dtype == np.uint16:  # a picture file's
-        picture = picture // 257
     elif not 0 <= picture.min() <= picture.max() <= 255:
         raise ValueError(f"its numbers are in [{picture.min()}, {picture.max()}]")
     picture = picture.astype(np.uint8)
@@ -61,7 +62,7 @@ def to_frame(picture, crop=False):
 def read_array(path):
     """An .npy or .npz → (frames, is_first (T,) or None)."""
     saved, is_first = np.load(path, mmap_mode="r", allow_pickle=False), None
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         is_first, saved = saved.get("is_first"), saved["image"]
     elif saved.dtype.names:  # rows, like ours
         is_first, saved = saved["is_first"], saved["image"]
@@ -71,18 +72,23 @@ def read_array(path):
         raise ValueError(f"its array is {saved.dtype} {saved.shape}")
     if saved.dtype.kind not in "fuib" or is_first is not None and len(is_first) != len(saved):
         raise ValueError(f"its array is {saved.dtype} {saved.shape} with is_first {is_first}")
-    if path.suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         return saved, is_first
     # Mapped anew for each frame: what has been read does not stay in memory.
     field = "image" if is_first is not None else ...
     count = range(len(saved))
     return (np.load(path, mmap_mode="r")[field][index] for index in count), is_first
 
+def read_picture(path):
+    """A picture file; one of 16 bits in 8."""
+    picture = iio.imread(path)
+    return picture // 257 if picture.dtype == np.uint16 else picture
+
 def read_video(path):
     """→ (its pictures one by one, is_first (T,) or None)."""
     if path.is_dir():
-        return (iio.imread(picture) for picture in pictures_in(path)), None
-    if path.suffix in (".npy", ".npz"):
+        return (read_picture(picture) for picture in pictures_in(path)), None
+    if path.suffix.lower() in (".npy", ".npz"):
         return read_array(path)
     return iio.imiter(path), None
 
@@ -95,6 +101,8 @@ def import_video(path, target, crop=False):
         diswm.write_whole(target / f"{name}-{(count - 1) // CHUNK:05d}.npy", file.getbuffer())
         rows.clear()
 
+    for old in target.glob(f"{glob.escape(name)}-{5 * '[0-9]'}.npy"):
+        old.unlink()  # of an import that may have been longer
     with diswm.reading(path, "video", CONVERT):
         pictures, is_first = read_video(path)
         for picture in pictures:
@@ -116,11 +124,17 @@ def find_videos(source):
     """The videos of a folder, or the one that a path is."""
     if not source.exists():
         raise diswm.UserError(f"there is no {source}")
-    if source.is_file() or pictures_in(source):
+    if source.is_file():
         return [source]
     known = (*FILMS, ".npy", ".npz")
     paths = [path for path in sorted(source.iterdir()) if path.suffix.lower() in known
              or path.is_dir() and pictures_in(path)]
+    pictures = pictures_in(source)
+    if pictures and paths:
+        raise diswm.UserError(f"{source} holds videos, as {paths[0].name}, and single pictures, as "
+                              f"{pictures[0].name}; move one kind elsewhere")
+    if pictures:
+        return [source]
     if not paths:
         raise diswm.UserError(f"there are no videos in {source}: no *{', *'.join(known)}, and no "
                               "folders of pictures")

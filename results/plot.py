@@ -1,11 +1,11 @@
 """Learning curves of finetune runs: means over seeds with bootstrap 95 % intervals.
 
-A run is a folder …/<tasks>/<method>/seed<k> with a metrics.jsonl. Runs whose config.json agree in
-all but the seed are the seeds of one curve. Beside the picture, and on the terminal, are figures:
-final (mean of the last three evaluations up to final_step, the last that all seeds have), area
-(under the curve up to there, by its length in env steps), before and after (the evaluations around
-the change of colours). Each is [mean, low, high] over the seeds, or [mean] of one seed. `minus` has
-the same of the differences to other methods, seed by seed.
+A run is a folder …/<tasks>/<method>/seed<k> with a metrics.jsonl. Runs whose config.json agree,
+but for the seed and what changes no result, are the seeds of one curve. Beside the picture, and on
+the terminal, are figures: final (mean of the last three evaluations up to final_step, the last that
+all seeds have), area (under the curve up to there, by its length in env steps), before and after
+(the evaluations around the change of colours). Each is [mean, low, high] over the seeds, or [mean]
+of one seed. `minus` has the same of the differences to other methods, seed by seed.
 """
 
 import json
@@ -58,9 +58,14 @@ def read_run(folder, metric="eval_return"):
     return SimpleNamespace(folder=folder, curve=curve, switch=switch, config=config, src=src,
                            dst=dst, label=label, seed=seed)
 
+def color_change(config):
+    """The env step at which a run's colours change, or None."""
+    return round(config["switch"] * config["steps"]) if config["switch"] < 1 else None
+
 def check_seeds(runs, where):
     """Raise UserError unless runs under one label differ in their seed, and in nothing else."""
     label, known = runs[0].label, [run for run in runs if run.config]
+    known.sort(key=lambda run: -len(run.config))  # the first has all fields
     for run in known[1:]:
         for name, value in known[0].config.items():
             other = run.config.get(name, value)  # a field that came later says nothing
@@ -70,6 +75,10 @@ def check_seeds(runs, where):
                     f"{known[0].folder} and {run.folder} are both {label}, but {name} is {value} "
                     f"and {other}; they are no seeds of one method: train one with --tag NAME, or "
                     "plot them apart")
+        one, other = color_change(known[0].config), color_change(run.config)
+        if one != other:
+            raise diswm.UserError(f"{known[0].folder} and {run.folder} are both {label}, but their "
+                                  f"colours change at step {one} and {other}; plot them apart")
     seeds = {}
     for run in runs:
         if run.seed in seeds:
@@ -113,13 +122,15 @@ def curve_figures(runs, switch=None):
                 each=runs, switch=switch, final_step=shared[-1]) | figures
 
 def paired_differences(ours, theirs, switch=None):
-    """Figures of what a method has more than another, seed by seed: {} unless they share two seeds.
-    ours, theirs: {seed: {env step: value}}."""
+    """Figures of what a method has more than another, seed by seed, up to the last step that all
+    have; {} unless they share two seeds and a step. ours, theirs: {seed: {env step: value}}."""
     gaps = [{step: value - theirs[seed][step] for step, value in ours[seed].items()
              if step in theirs[seed]} for seed in sorted(ours.keys() & theirs.keys())]
-    if len(gaps) < 2:
+    if len(gaps) < 2 or not set.intersection(*map(set, gaps)):
         return {}
-    return {name: mean_interval(values) for name, values in seed_figures(gaps, switch)[1].items()}
+    shared, figures = seed_figures(gaps, switch)
+    return dict(seeds=len(gaps), final_step=shared[-1]) | {
+        name: mean_interval(values) for name, values in figures.items()}
 
 def collect_figures(folders, metric="eval_return", by="pair"):
     """Runs → {panel: {label: curve_figures}}; a panel is a pair of tasks, by src a target."""
@@ -139,16 +150,19 @@ def collect_figures(folders, metric="eval_return", by="pair"):
         raise diswm.UserError(f"no {metric} to plot; run: python diswm.py finetune")
     result = {}
     for panel, labels in tqdm(panels.items(), "intervals", leave=False, disable=None):
-        switch = max(run.switch or 0 for runs in labels.values() for run in runs) or None
-        curves, result[panel] = {}, {}
+        curves, switches, result[panel] = {}, {}, {}
         for label, runs in sorted(labels.items()):
             check_seeds(runs, panel)
             curves[label] = {run.seed: run.curve for run in runs}
+            switches[label] = max((run.switch for run in runs if run.switch), default=None)
         for label, ours in curves.items():
+            switch, minus = switches[label], {}
+            for other in curves:
+                if other > label:  # each pair once
+                    common_switch = switch if switches[other] == switch else None
+                    gaps = paired_differences(ours, curves[other], common_switch)
+                    minus |= {other: gaps} if gaps else {}
             figures = curve_figures([*ours.values()], switch)
-            minus = {other: paired_differences(ours, theirs, switch)
-                     for other, theirs in curves.items() if other > label}  # each pair once
-            minus = {other: gaps for other, gaps in minus.items() if gaps}
             result[panel][label] = figures | dict(minus=minus)
     return result
 
@@ -196,8 +210,7 @@ def draw(result, path, metric="eval_return"):
             if label in methods:
                 draw_curve(axes, methods[label], color, line)
     for axes, (panel, methods) in zip(panels, result.items(), strict=False):
-        switch = next(iter(methods.values()))["switch"]  # the same for all methods
-        if switch:
+        for switch in {figures["switch"] for figures in methods.values()} - {None}:
             axes.axvline(switch, color="gray", ls=":")
             switches.add(switch)
         axes.set(title=panel, ylim=(min(0, axes.get_ylim()[0]), None),  # the pusher's are below 0
@@ -224,8 +237,9 @@ def print_table(result):
                   *(f"{name} {rounded(figures[name])}" for name in FIGURES if name in figures),
                   sep=", ")
             for other, gaps in figures["minus"].items():
-                print(f"    minus {other}, seed by seed",
-                      *(f"{name} {rounded(gap)}" for name, gap in gaps.items()), sep=", ")
+                print(f"    minus {other}, {gaps['seeds']} seeds, at {gaps['final_step']:,}",
+                      *(f"{name} {rounded(gaps[name])}" for name in FIGURES if name in gaps),
+                      sep=", ")
 
 def main(argv=None):
     parser = diswm.Parser(description=__doc__.split("\n")[0])

@@ -128,7 +128,7 @@ def report(run):
             f"<style>{STYLE}</style>\n<h1>{title}</h1>\n" + "\n".join(sections)
             + f"\n<script>{SCRIPT}</script></html>\n")
     (run / "report.html").write_text(page, encoding="utf-8")
-    print(f"wrote {run}/report.html ({len(page) / 1e6:.1f} MB), film.gif, traversal.mp4, curve.png")
+    print(f"wrote {run}/report.html ({len(page) / 1e6:.1f} MB) and film.gif")
 
 def main(argv=None):
     parser = diswm.Parser(description=__doc__.split("\n")[0])

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import common
 import numpy as np
+import plot
 import torch
 from tqdm import tqdm
 
@@ -26,7 +27,9 @@ def draw_clips(folder, count, length, rng):
     if (room > 0).sum() < 2:
         raise diswm.UserError(f"{folder} has no two episodes of {length} frames; use a smaller "
                               "--length")
-    clips, episodes = [], rng.choice(len(room), count, p=room / room.sum())
+    clips, episodes = [], []
+    while len(set(episodes)) < 2:
+        episodes = rng.choice(len(room), count, p=room / room.sum())
     for index in episodes:
         start = rng.integers(room[index])
         clips.append(np.array(replay.read(replay.paths[index])["image"][start:start + length]))
@@ -47,12 +50,6 @@ def nearest_distance(points, others, episodes=None):
     nearest = distance.min(1).values
     return nearest[nearest.isfinite()].numpy()  # inf: all clips are of one episode
 
-def mean_interval(values):
-    """[mean, low, high] with the 95 % bootstrap interval over clips."""
-    from scipy.stats import bootstrap  # slow to import
-    found = bootstrap([values], np.mean, method="percentile", rng=0).confidence_interval
-    return [float(np.mean(values)), float(found.low), float(found.high)]
-
 def draw(points, figures, path, title):
     """points: {set: (N, 2)}"""
     from matplotlib.figure import Figure  # slow to import
@@ -68,7 +65,7 @@ def draw(points, figures, path, title):
 
 def find_videos(cfg, run):
     """The episodes of a finished collect run beside a finetune run, whatever its folder is now."""
-    runs = str(run.resolve().parents[3])
+    runs = str(run.resolve().parent.parent.parent.parent)
     folder = diswm.run_folder(replace(cfg, runs=runs, method="dreamerv2", tag=""), "collect")
     path = diswm.finished_run(folder)
     if path:
@@ -88,8 +85,8 @@ def measure(run, videos=None, clips=200, length=50, seed=0):
     for name, folder in folders.items():
         images, episodes = draw_clips(folder, clips, length, rng)
         latents[name] = x = clip_latents(agent.teacher, images, cfg.device)
-        figures[name] = mean_interval(nearest_distance(x, x, episodes))
-    figures["replay to videos"] = mean_interval(
+        figures[name] = plot.mean_interval(nearest_distance(x, x, episodes))
+    figures["replay to videos"] = plot.mean_interval(
         nearest_distance(latents["replay"], latents["videos"]))
     flat = TSNE(random_state=seed, perplexity=min(30, clips // 2)).fit_transform(
         np.concatenate([*latents.values()]))

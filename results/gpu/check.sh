@@ -9,18 +9,19 @@
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.." || exit 1
 export MUJOCO_GL=${MUJOCO_GL:-egl} OUT=${OUT:-results/gpu}
-python=${PYTHON:-python3} preset=${PRESET:-} begin=$SECONDS
+python=${PYTHON:-python3} preset=${PRESET:-} begin=$SECONDS code=0
 mkdir -p "$OUT"
+rm -f "$OUT/walker_walk.jsonl"
 card=$($python -c 'import torch
 name = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
 print(name.replace(" ", "_"))')
 
 echo "(a) graph and plain calls"
-timeout 120 $python results/gpu/compare.py "${preset:-paper}" 2>&1 | tee "$OUT/graph.txt"
+timeout 120 $python results/gpu/compare.py "${preset:-paper}" 2>&1 | tee "$OUT/graph.txt" || code=1
 
 echo "(b) bench"
 for size in ${preset:-paper small}; do
-    timeout 75 $python results/bench.py --preset "$size" --tasks walker_walk --json >"$OUT/$card-$size.json" && cat "$OUT/$card-$size.json"
+    timeout 75 $python results/bench.py --preset "$size" --tasks walker_walk --json >"$OUT/$card-$size.json" && cat "$OUT/$card-$size.json" || code=1
 done
 
 echo "(c) yardstick, in what is left of 570 seconds"
@@ -29,5 +30,6 @@ timeout --signal=INT $((570 - SECONDS + begin)) $python diswm.py finetune --pres
     --colors original --color-range 0 --switch 1 --steps "${STEPS:-100000}" --eval-every 20000 --eval-episodes 5 --runs "$runs"
 cp "$runs"/finetune/*/dreamerv2/seed0/metrics.jsonl "$OUT/walker_walk.jsonl"
 rm -r "$runs"
-tail -n 1 "$OUT/walker_walk.jsonl"
+tail -n 1 "$OUT/walker_walk.jsonl" || code=1
 echo "took $((SECONDS - begin)) s on $card"
+exit $code
