@@ -147,7 +147,7 @@ def collect_figures(folders, metric="eval_return", by="pair"):
             run.label += f" from {run.src}"
         panels.setdefault(panel, {}).setdefault(run.label, []).append(run)
     if not panels:
-        raise diswm.UserError(f"no {metric} to plot; run: python diswm.py finetune")
+        raise diswm.UserError(f"no {metric} to plot; name runs, or their folder: --runs")
     result = {}
     for panel, labels in tqdm(panels.items(), "intervals", leave=False, disable=None):
         curves, switches, result[panel] = {}, {}, {}
