@@ -1080,8 +1080,8 @@ class Agent(nn.Module):
             slow[name].lerp_(value, due)
         with self.model.autocast:
             actor_loss, critic_loss, more = behaviour.losses(self.model, start, discount)  # 16
-        metrics["critic_grad_norm"] = descend(critic_loss, self.optimizers["critic"], cfg.grad_clip)
-        metrics["actor_grad_norm"] = descend(actor_loss, self.optimizers["actor"], cfg.grad_clip)
+        for part, loss in dict(critic=critic_loss, actor=actor_loss).items():  # 17, 18
+            metrics[f"{part}_grad_norm"] = descend(loss, self.optimizers[part], cfg.grad_clip)
         return {name: x.detach() for name, x in (metrics | more).items()} | dict(eta=batch["eta"])
 
 def prepare_machine(cfg):
