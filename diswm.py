@@ -131,7 +131,7 @@ class Config:
     grad_clip: float = 100.0  # largest gradient norm of an optimiser
     # --- methods: what makes them
     encoder: str = "beta_vae"  # and decoder; conv: DreamerV2's (paper)
-    carry_over: str = "none"  # the video model's weights start the model's, or lie below it (paper)
+    carry_over: str = "none"  # weights: start from the video model's; stack: on its RSSM (paper)
     bonus: float = 0.0  # weight of the intrinsic bonus in the reward (APV: 0.1)
     z_dim: int = 20  # size of the β-VAE latent (table)
     beta: float = 0.015  # β, weight of the disentanglement loss in Eq. (5) (table)

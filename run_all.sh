@@ -309,10 +309,11 @@ finetune_all() {
 }
 
 show_results() {
-    local training run plot=(results/plot.py --out "$runs/curves.png" --by pair)
+    local training run plot by=pair
     if [[ -n $(printf '%s\n' $pairs | sed 's/.*://' | sort | uniq -d) ]]; then
-        plot[4]=src  # a target of several sources: Fig. 8
+        by=src  # a target of several sources: Fig. 8
     fi
+    plot=(results/plot.py --out "$runs/curves.png" --by "$by")
     for training in "${trainings[@]}"; do
         run=${training%% *}
         diswm evaluate --run "$run"

@@ -28,7 +28,7 @@ def draw_clips(folder, count, length, rng):
         raise diswm.UserError(f"{folder} has no two episodes of {length} frames; use a smaller "
                               "--length")
     clips, episodes = [], []
-    while len(set(episodes)) < 2:
+    while len(set(episodes)) < 2:  # else no clip has one of another episode
         episodes = rng.choice(len(room), count, p=room / room.sum())
     for index in episodes:
         start = rng.integers(room[index])
@@ -47,8 +47,7 @@ def nearest_distance(points, others, episodes=None):
     distance = torch.cdist(torch.from_numpy(points).double(), torch.from_numpy(others).double())
     if episodes is not None:
         distance[torch.from_numpy(episodes[:, None] == episodes)] = torch.inf
-    nearest = distance.min(1).values
-    return nearest[nearest.isfinite()].numpy()  # inf: all clips are of one episode
+    return distance.min(1).values.numpy()
 
 def draw(points, figures, path, title):
     """points: {set: (N, 2)}"""
