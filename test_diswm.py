@@ -10,7 +10,6 @@ import contextlib
 import copy
 import dataclasses
 import functools
-import gc
 import hashlib
 import inspect
 import io
@@ -19,6 +18,7 @@ import json
 import multiprocessing
 import os
 import re
+import resource
 import runpy
 import shlex
 import shutil
@@ -436,26 +436,6 @@ def test_eta_is_zero_before_its_delay_then_falls_in_a_line_to_its_end(
         line = np.interp(step, [delay, delay + decay * (1 - rest / start)], [start, rest])
         eta = diswm.eta_schedule(step, start, end, decay, delay)
         assert eta == pytest.approx(line if step >= delay else 0.0) and eta <= start
-
-@pytest.mark.parametrize("delay", [0, 25])
-def test_eta_differs_between_the_updates_of_a_live_run(delay):
-    """In the real loop every update sees η of the decisions so far, prefill included. The published
-    code copies the step once: η stays at 0.095, across domains at 0."""
-    cfg = tiny_config(steps=120, prefill=10, train_every=5, eta=0.6, eta_end=0.06, eta_decay=40,
-                      eta_delay=delay, eval_every=10**6, eval_episodes=1)
-    env, seen, update = FakeEnv(), [], diswm.Agent.update
-
-    def spy(*args):
-        metrics = update(*args)
-        seen.append((env.count, metrics["eta"].item()))
-        return metrics
-    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
-        patch.setattr(diswm.Agent, "update", spy)
-        train_fake(cfg, folder, env)
-    assert len(seen) > 8 and len({eta for _, eta in seen}) > 4
-    for decisions, eta in seen:
-        live = 0.0 if decisions < delay else max(0.6 * (1 - (decisions - delay) / 40), 0.06)
-        assert eta == pytest.approx(live)
 
 # === Returns and actor-critic =====================================================================
 
@@ -1012,11 +992,11 @@ def test_the_bonus_is_added_to_the_rewards_target_and_the_last_rows_have_none(ca
 
 @pytest.mark.parametrize("method, encoder", [
     ("dv2_finetune", "conv"), ("dv2_finetune", "beta_vae"), ("apv", "conv")])
-def test_carried_weights_see_videos_as_the_predictor_did_and_all_else_is_fresh(method, encoder):
+def test_carried_weights_see_videos_as_the_predictor_did(method, encoder):
     """A predictor without actions fits one that gets zeros, or the RSSM below in any case."""
     cfg = tiny_config(method, encoder=encoder)
     video, world = diswm.VideoPredictor(cfg), diswm.WorldModel(cfg, 2)
-    before, batch = snapshot(world), as_batch(fake_batch(2, 4))
+    batch = as_batch(fake_batch(2, 4))
     world.carry_over(video)
     zeros = batch | dict(action=torch.zeros_like(batch["action"]))
     with no_noise():
@@ -1024,110 +1004,6 @@ def test_carried_weights_see_videos_as_the_predictor_did_and_all_else_is_fresh(m
         below = world(batch)["post"].get("below", states["feat"])
     assert torch.allclose(below, seen["feat"], atol=1e-4)
     assert torch.equal(world.decoder(seen["feat"]), video.decoder(seen["feat"]))
-    pretrained = ("encoder.", "decoder.", "rssm.below." if method == "apv" else "rssm.")
-    for name, value in world.state_dict().items():
-        if not name.startswith(pretrained):
-            assert torch.equal(value.nan_to_num(), before[name].nan_to_num())  # an empty queue
-    # So are the actions' input weights, which the predictor has not.
-    columns = [w["rssm.inputs.0.weight"][:, cfg.stoch:] for w in (before, world.state_dict())]
-    assert torch.equal(*columns)
-
-# === The tests bite: a real bug of the method put back makes its test fail ========================
-
-def teacher_in_the_optimiser(real, agent, cfg, action_dim):
-    """The published code: the teacher's gradients on, its weights in the model's optimiser."""
-    real(agent, cfg, action_dim)
-    agent.teacher.requires_grad_(True)
-    together = torch.nn.ModuleList([agent.model, agent.teacher])
-    agent.optimizers["model"] = diswm.adam(together, cfg.model_lr)
-
-def teacher_trained_too(real, z_disen, z_task):
-    """A distillation loss without the stop-gradient."""
-    log_p, log_q = z_disen.log_softmax(-1), z_task.log_softmax(-1)
-    return (log_p.exp() * (log_p - log_q)).sum((-1, -2)).mean()
-
-def the_old_actor(real, behaviour, feat):
-    """The published normal around tanh(m)."""
-    behaviour.cfg = dataclasses.replace(behaviour.cfg, actor="clipped")
-    return real(behaviour, feat)
-
-def free_nats_first(real, post, prior, balance, free_nats):
-    """Free nats on every step, before the mean."""
-    value = real(post, prior, balance, free_nats)[1]
-    return value.clamp(min=free_nats).mean(), value
-
-def action_kept(real, rssm, state, action, embed, keep):
-    """`is_first` forgets the state, but not the action of another episode."""
-    state = {key: x * keep for key, x in state.items()}
-    return real(rssm, state, action, embed, torch.ones_like(keep))
-
-distillation = (
-    test_distillation_is_equation_3_summed_over_time_and_averaged_over_the_batch, 0, 2, 3, 5)
-returns = test_lambda_return_is_the_mixture_of_all_n_step_returns_in_time_order, 0, 5, 3, 0.95
-losses = test_actor_and_critic_losses_are_those_of_appendix_b, 0, 0.6
-seam = test_is_first_forgets_the_state_and_the_previous_action, "RSSM", 0, 3
-METHOD_BUGS = {  # name: what is patched; the bug; the tests that must fail, and their arguments
-    "teacher in the optimiser": (
-        "Agent.__init__", teacher_in_the_optimiser,
-        (test_teacher_bytes_are_unchanged_by_updates_and_in_no_optimiser,)),
-    "teacher trained by the loss": ("distillation_loss", teacher_trained_too, distillation),
-    "distillation averaged over time": (
-        "distillation_loss", lambda real, p, q: real(p, q) / p.shape[1], distillation),
-    "distillation in the wrong direction": (
-        "distillation_loss", lambda real, p, q: real(q, p), distillation),
-    "eta stuck at its first step": (
-        "eta_schedule", lambda real, step, *args: real(0, *args),
-        (test_eta_differs_between_the_updates_of_a_live_run, 0)),
-    "v_t for v_{t+1}": (
-        "lambda_return", lambda real, r, v, d, b, l:
-        real(r, torch.cat([v[:1], v[:-1]]), d, v[-1], l), returns, losses),
-    "reversed returns": (
-        "lambda_return", lambda real, *args: real(*args).flip(0), returns, losses),
-    "returns that go on after the end": (
-        "lambda_return", lambda real, r, v, d, b, l: real(r, v, d * 0 + 0.99, b, l),
-        returns, losses),
-    "actions that learn nothing from where they lead": (
-        "ActorCritic.squash", lambda real, self, x: tuple(y.detach() for y in real(self, x)),
-        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0, 0)),
-    "the old actor, which one side can hold for good": (
-        "ActorCritic.policy", the_old_actor,
-        (test_an_actor_on_the_wrong_side_always_learns_that_it_is, 20.0, 1)),
-    "the old actor, which starts at one side": (
-        "ActorCritic.policy", the_old_actor,
-        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0, 8)),
-    "unclipped action": (
-        "ActorCritic.squash", lambda real, self, x: (x, torch.zeros_like(x)),
-        (test_acted_and_imagined_actions_stay_inside_the_bounds, "clipped")),
-    "plain clamp of an action": (
-        "ActorCritic.squash",
-        lambda real, self, x: (x.clamp(1e-6 - 1, 1 - 1e-6), torch.zeros_like(x)),
-        (test_clipped_actions_stay_in_bounds_and_keep_their_gradient, [-9.0, 0.5, 9.0])),
-    "unclipped gradient": (
-        "descend", lambda real, loss, optimizer, clip: real(loss, optimizer, 1e9),
-        (test_a_step_is_clipped_adam_on_the_optimisers_own_weights_and_no_others, 1e-2)),
-    "free nats before the mean": (
-        "rssm_kl_loss", free_nats_first,
-        (test_the_kl_loss_is_the_batch_mean_or_the_free_nats_if_they_are_more, 0, 3, 3, 0.8, 3.0)),
-    "KL balance the wrong way round": (
-        "rssm_kl_loss", lambda real, q, p, balance, free: real(q, p, 1 - balance, free),
-        (test_kl_gradient_is_split_balance_to_the_prior_and_the_rest_to_the_posterior, 0, 1.0, -1)),
-    "means for samples": (
-        "Normal.rsample", lambda real, self: self.mean, (test_latents_are_sampled_not_means,)),
-    "state kept across a seam": ("RSSM.step", lambda real, *args: real(*args[:-1], 1), seam),
-    "action kept across a seam": ("RSSM.step", action_kept, seam)}
-
-@pytest.mark.parametrize("bug", METHOD_BUGS)
-def test_a_planted_bug_of_the_method_is_caught(bug, monkeypatch):
-    """The real tests pass, and each fails once the bug is in the production function."""
-    name, plant, *tests = METHOD_BUGS[bug]
-    *owner, attribute = name.split(".")
-    owner = getattr(diswm, owner[0]) if owner else diswm
-    real = getattr(owner, attribute)
-    for outcome in (contextlib.nullcontext(), pytest.raises(AssertionError)):
-        for test, *args in tests:
-            with outcome:  # of the test itself: hypothesis would look for its own examples
-                getattr(getattr(test, "hypothesis", None), "inner_test", test)(*args)
-        monkeypatch.setattr(owner, attribute, lambda *args: plant(real, *args))
 
 # === Graphs: what a GPU does, on a CPU ============================================================
 
@@ -1659,8 +1535,10 @@ def test_colors_fill_the_box_of_their_phase(phase, half, seed, colors):
     assert (draws >= low - 1e-6).all() and (draws <= high + 1e-6).all()
     assert (np.ptp(draws, axis=0) > 0.5 * (high - low)).all()
 
-def check_action_repeat_sums_rewards(repeat=2):
-    """make_env(action_repeat=n) against n plain steps of the simulator, for 12 decisions."""
+@pytest.mark.parametrize("repeat", [1, 2, 5])
+def test_action_repeat_sums_the_rewards_of_its_steps_once(repeat):
+    """Against plain steps of the simulator. Published code: `reward += reward` doubles them; two
+    wrappers apply the repeat twice."""
     raw, rng = diswm.DMControlEnv("walker", "walk"), np.random.default_rng(repeat)
     with raw, make_env("walker_walk", action_repeat=repeat) as env:
         raw.reset(seed=repeat)
@@ -1671,23 +1549,6 @@ def check_action_repeat_sums_rewards(repeat=2):
             rewards = [raw.step(action)[1] for _ in range(repeat)]
             assert reward > 0 and np.isclose(reward, sum(rewards), rtol=1e-9)
             assert (env.unwrapped.data.qpos == raw.data.qpos).all() and info["env_steps"] == repeat
-
-@pytest.mark.parametrize("repeat", [1, 2, 5])
-def test_action_repeat_sums_the_rewards_of_its_steps_once(repeat):
-    """Published code: `reward += reward` doubles them; two wrappers apply the repeat twice."""
-    check_action_repeat_sums_rewards(repeat)
-
-@pytest.mark.parametrize("weights", [(2, 2), (1, 1, 1, 1), (0, 1)],
-                         ids=["doubled reward", "doubled repeat", "last reward"])
-def test_planted_action_repeat_bug_is_noticed(weights, monkeypatch):
-    """The check above bites. weights: of the rewards of the steps that are made."""
-    def planted(self, action):
-        results = [self.env.step(action) for _ in weights]
-        reward = sum(weight * result[1] for weight, result in zip(weights, results, strict=True))
-        return self.render(), reward, *results[-1][2:4], dict(env_steps=2)
-    monkeypatch.setattr(diswm.DistractingEnv, "step", planted)
-    with pytest.raises(AssertionError):
-        check_action_repeat_sums_rewards()
 
 @pytest.mark.parametrize("task, given, repeat, limit", [
     ("walker_walk", 7, 2, 7), ("walker_walk", 0, 30, 1000), ("pusher", 0, 30, 100),
@@ -1833,13 +1694,8 @@ REFUSED = {  # why: (the command's words, what it says)
     "no latents": ("finetune --encoder conv --teacher {teacher}", "add --encoder beta_vae"),
     "weights": ("finetune --carry-over weights --hidden 7 --teacher {teacher}", "add --hidden 10"),
     "source is target": ("finetune --dst cheetah_run --teacher {teacher}", "both cheetah_run"),
-    "no such target": ("finetune --dst walker_wak --teacher {teacher}", "walker_walk"),
-    "no such source": ("finetune --src cheetah_rum --teacher {teacher}", "cheetah_run"),
     "discrete actions": ("finetune --dst CartPole-v1 --teacher {teacher}", "continuous actions"),
-    "wrong value": ("finetune --teacher {teacher} --batch-size 0", "--batch-size 0"),
     "no videos": ("pretrain --videos .", "results/import_videos.py"),
-    "nothing to pretrain for": ("pretrain --src cheetah_rum", "cheetah_run"),
-    "nothing to collect": ("collect --src cheetah_rum", "cheetah_run"),
     "no run to evaluate": ("evaluate --run lost", "python diswm.py finetune"),
     "no policy to evaluate": ("evaluate --run {video}", "give a finetune run"),
     "no run to traverse": ("traverse --run lost", "python diswm.py finetune"),
@@ -1852,9 +1708,7 @@ def test_a_refused_start_says_in_one_line_what_is_missing_and_leaves_no_folder(
     monkeypatch.chdir(tmp_path)
     words, says = REFUSED[why]
     words = words.format(**files).split()
-    usage = {"walker_wak", "cheetah_rum", "--batch-size"} & set(words)
-    refuse(*words, *(DEBUG if words[0] not in ("evaluate", "traverse") else ()), says=says,
-           code=2 if usage else 1)
+    refuse(*words, *(DEBUG if words[0] not in ("evaluate", "traverse") else ()), says=says)
     assert not list(tmp_path.iterdir())
 
 def test_teacher_and_student_of_one_seed_start_apart(files, tmp_path):
@@ -1940,37 +1794,7 @@ def test_pretraining_learns_from_images_and_where_episodes_begin_alone(files, tm
         "checkpoint.pt")["model"] for videos in (tmp_path / "bare", files["set"]))
     assert one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
 
-@pytest.mark.parametrize("method", ["diswm", "apv"])
-def test_finetuning_leaves_its_teacher_as_it_was_and_goes_on_without_it_bit_for_bit(
-        method, files, tmp_path, real=diswm.derived_seed):
-    """The published code trains the teacher along. Weights, optimisers and APV's queue,
-    projection and running mean are in the checkpoint: the pretraining is no longer needed."""
-    def cut(*args):
-        if args[1:] == ("finetune", 3):  # an episode after learning has begun
-            raise Stop
-        return real(*args)
-    source, ends = files["conv" if METHODS[method] else "teacher"], []
-    for name, seed in (("uncut", real), ("cut", cut)):
-        video = shutil.copy(source, tmp_path / name)
-        cfg = tiny_config(method, dst="cartpole_swingup", runs=str(tmp_path / f"{name} runs"),
-                          steps=200, teacher=str(video), eval_episodes=1)
-        with pytest.MonkeyPatch.context() as patch, contextlib.suppress(Stop):
-            patch.setattr(diswm, "derived_seed", seed)
-            diswm.finetune(cfg)
-        gc.collect()  # the lock goes with the run
-        assert video.read_bytes() == source.read_bytes()
-        video.unlink()
-        state = torch.load(diswm.finetune(dataclasses.replace(cfg, teacher="")) / "checkpoint.pt")
-        ends.append(state["agent"])
-    agent, resumed = ends
-    assert state["done"]["updates"] > 5 and agent.keys() == resumed.keys()
-    assert_identical(agent, resumed)
-    for key, value in torch.load(source)["model"].items():
-        if key.startswith("encoder."):
-            assert not torch.equal(value, agent[f"model.{key}"])
-            assert torch.equal(value, agent.get(key.replace("encoder", "teacher"), value))
-
-def schedule(cfg, folder, env, stop_after=None):
+def schedule(cfg, folder, env):
     """Train in FakeEnv without learning → (decisions before which the agent acted, and of each
     update: decisions until then, rows in the replay, its index, its η)."""
     acted, updates, act, sample = [], [], diswm.Agent.act, Replay.sample
@@ -1988,16 +1812,19 @@ def schedule(cfg, folder, env, stop_after=None):
         patch.setattr(diswm.Agent, "act", counted_act)
         patch.setattr(diswm.Agent, "update", update)
         patch.setattr(Replay, "sample", counted_sample)
-        train_fake(cfg, folder, env, stop_after=stop_after)
+        train_fake(cfg, folder, env)
     return acted, updates
 
 @given(prefill=st.integers(0, 35), first=st.integers(1, 4), every=st.integers(1, 6),
        length=st.integers(2, 25), delay=st.integers(-1, 40), decay=st.integers(5, 60),
        dst=st.sampled_from(["walker_walk", "pusher", "drawer_open", "FetchReach-v4"]))
 @example(prefill=15, first=3, every=5, length=8, dst="pusher", delay=-1, decay=20)
+@example(prefill=20, first=3, every=5, length=8, dst="walker_walk", delay=-1, decay=20)
 def test_prefill_then_first_updates_then_steady_state_on_a_live_eta(
         prefill, first, every, length, dst, delay, decay):
-    """The published schedule. η counts live decisions, prefill included: delay, decay, floor."""
+    """The published schedule. η counts live decisions, prefill included: delay, decay, floor. The
+    bugs it kills: the published code copies the step once, so η stays at 0.095, across domains at
+    0; learning began before the second of two random episodes was stored."""
     cfg = tiny_config("diswm", dst=dst, prefill=prefill, first_updates=first, train_every=every,
                       batch_length=length, eta_delay=delay, eta_decay=decay, eta=0.1, eta_end=0.01)
     with tempfile.TemporaryDirectory() as folder:
@@ -2025,18 +1852,115 @@ def test_a_run_too_short_for_an_update_warns_at_its_start(
     assert ("warning: --steps end" in caplog.messages[1]) == short == (run.done.updates == 0)
     assert min(row["rate"] for row in log_rows(run.folder)) > 0
 
-@pytest.mark.parametrize("cut", [1, 2, 3, 99])
-def test_first_updates_wait_until_all_prefill_episodes_are_in_the_replay(cut, tmp_path):
-    """The bug it kills: with 20 random decisions in episodes of 10, learning began before the
-    second one was stored, with half of the data. Also in runs that are cut off and go on."""
-    cfg = tiny_config("dreamerv2", prefill=20, first_updates=3, train_every=5)
-    env, acted, updates = FakeEnv(), [], []
-    for stop_after in (cut, None):
-        more = schedule(cfg, tmp_path, env, stop_after)
-        acted, updates = acted + more[0], updates + more[1]
-    decisions, rows, index, _ = zip(*updates, strict=True)
-    assert acted == list(range(20, 50)) and decisions == (25, 25, 25, 30, 35, 40, 45, 50)
-    assert rows == (22, 22, 22, 22, 33, 33, 44, 44) and index == tuple(range(8))
+# === The tests bite: a real bug of the method put back makes its test fail ========================
+
+def teacher_in_the_optimiser(real, agent, cfg, action_dim):
+    """The published code: the teacher's gradients on, its weights in the model's optimiser."""
+    real(agent, cfg, action_dim)
+    agent.teacher.requires_grad_(True)
+    together = torch.nn.ModuleList([agent.model, agent.teacher])
+    agent.optimizers["model"] = diswm.adam(together, cfg.model_lr)
+
+def teacher_trained_too(real, z_disen, z_task):
+    """A distillation loss without the stop-gradient."""
+    log_p, log_q = z_disen.log_softmax(-1), z_task.log_softmax(-1)
+    return (log_p.exp() * (log_p - log_q)).sum((-1, -2)).mean()
+
+def the_old_actor(real, behaviour, feat):
+    """The published normal around tanh(m)."""
+    behaviour.cfg = dataclasses.replace(behaviour.cfg, actor="clipped")
+    return real(behaviour, feat)
+
+def free_nats_first(real, post, prior, balance, free_nats):
+    """Free nats on every step, before the mean."""
+    value = real(post, prior, balance, free_nats)[1]
+    return value.clamp(min=free_nats).mean(), value
+
+def action_kept(real, rssm, state, action, embed, keep):
+    """`is_first` forgets the state, but not the action of another episode."""
+    state = {key: x * keep for key, x in state.items()}
+    return real(rssm, state, action, embed, torch.ones_like(keep))
+
+def steps_weighted(*weights):
+    """Action repeat that makes a step for each weight, and sums rewards by them."""
+    def step(real, env, action):
+        results = [env.env.step(action) for _ in weights]
+        reward = sum(weight * result[1] for weight, result in zip(weights, results, strict=True))
+        return env.render(), reward, *results[-1][2:4], dict(env_steps=2)
+    return step
+
+repeat = test_action_repeat_sums_the_rewards_of_its_steps_once, 2
+distillation = (
+    test_distillation_is_equation_3_summed_over_time_and_averaged_over_the_batch, 0, 2, 3, 5)
+returns = test_lambda_return_is_the_mixture_of_all_n_step_returns_in_time_order, 0, 5, 3, 0.95
+losses = test_actor_and_critic_losses_are_those_of_appendix_b, 0, 0.6
+seam = test_is_first_forgets_the_state_and_the_previous_action, "RSSM", 0, 3
+METHOD_BUGS = {  # name: what is patched; the bug; the tests that must fail, and their arguments
+    "teacher in the optimiser": (
+        "Agent.__init__", teacher_in_the_optimiser,
+        (test_teacher_bytes_are_unchanged_by_updates_and_in_no_optimiser,)),
+    "teacher trained by the loss": ("distillation_loss", teacher_trained_too, distillation),
+    "distillation averaged over time": (
+        "distillation_loss", lambda real, p, q: real(p, q) / p.shape[1], distillation),
+    "distillation in the wrong direction": (
+        "distillation_loss", lambda real, p, q: real(q, p), distillation),
+    "eta stuck at its first step": (
+        "eta_schedule", lambda real, step, *args: real(0, *args),
+        (test_prefill_then_first_updates_then_steady_state_on_a_live_eta,
+         20, 3, 5, 8, "walker_walk", -1, 20)),
+    "v_t for v_{t+1}": (
+        "lambda_return", lambda real, r, v, d, b, l:
+        real(r, torch.cat([v[:1], v[:-1]]), d, v[-1], l), returns, losses),
+    "reversed returns": (
+        "lambda_return", lambda real, *args: real(*args).flip(0), returns, losses),
+    "returns that go on after the end": (
+        "lambda_return", lambda real, r, v, d, b, l: real(r, v, d * 0 + 0.99, b, l),
+        returns, losses),
+    "actions that learn nothing from where they lead": (
+        "ActorCritic.squash", lambda real, self, x: tuple(y.detach() for y in real(self, x)),
+        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0, 0)),
+    "the old actor, which one side can hold for good": (
+        "ActorCritic.policy", the_old_actor,
+        (test_an_actor_on_the_wrong_side_always_learns_that_it_is, 20.0, 1)),
+    "the old actor, which starts at one side": (
+        "ActorCritic.policy", the_old_actor,
+        (test_an_actor_learns_to_do_what_a_known_reward_asks_for, 1.0, 8)),
+    "unclipped action": (
+        "ActorCritic.squash", lambda real, self, x: (x, torch.zeros_like(x)),
+        (test_acted_and_imagined_actions_stay_inside_the_bounds, "clipped")),
+    "plain clamp of an action": (
+        "ActorCritic.squash",
+        lambda real, self, x: (x.clamp(1e-6 - 1, 1 - 1e-6), torch.zeros_like(x)),
+        (test_clipped_actions_stay_in_bounds_and_keep_their_gradient, [-9.0, 0.5, 9.0])),
+    "unclipped gradient": (
+        "descend", lambda real, loss, optimizer, clip: real(loss, optimizer, 1e9),
+        (test_a_step_is_clipped_adam_on_the_optimisers_own_weights_and_no_others, 1e-2)),
+    "free nats before the mean": (
+        "rssm_kl_loss", free_nats_first,
+        (test_the_kl_loss_is_the_batch_mean_or_the_free_nats_if_they_are_more, 0, 3, 3, 0.8, 3.0)),
+    "KL balance the wrong way round": (
+        "rssm_kl_loss", lambda real, q, p, balance, free: real(q, p, 1 - balance, free),
+        (test_kl_gradient_is_split_balance_to_the_prior_and_the_rest_to_the_posterior, 0, 1.0, -1)),
+    "means for samples": (
+        "Normal.rsample", lambda real, self: self.mean, (test_latents_are_sampled_not_means,)),
+    "state kept across a seam": ("RSSM.step", lambda real, *args: real(*args[:-1], 1), seam),
+    "action kept across a seam": ("RSSM.step", action_kept, seam),
+    "doubled reward": ("DistractingEnv.step", steps_weighted(2, 2), repeat),
+    "doubled repeat": ("DistractingEnv.step", steps_weighted(1, 1, 1, 1), repeat),
+    "the last step's reward alone": ("DistractingEnv.step", steps_weighted(0, 1), repeat)}
+
+@pytest.mark.parametrize("bug", METHOD_BUGS)
+def test_a_planted_bug_of_the_method_is_caught(bug, monkeypatch):
+    """The real tests pass, and each fails once the bug is in the production function."""
+    name, plant, *tests = METHOD_BUGS[bug]
+    *owner, attribute = name.split(".")
+    owner = getattr(diswm, owner[0]) if owner else diswm
+    real = getattr(owner, attribute)
+    for outcome in (contextlib.nullcontext(), pytest.raises(AssertionError)):
+        for test, *args in tests:
+            with outcome:  # of the test itself: hypothesis would look for its own examples
+                getattr(getattr(test, "hypothesis", None), "inner_test", test)(*args)
+        monkeypatch.setattr(owner, attribute, lambda *args: plant(real, *args))
 
 # === System: one whole pipeline ===================================================================
 
@@ -2413,8 +2337,8 @@ def cut_command(root, runs, method="diswm"):
     """130 decisions: learning from the 50th on, slow copies at updates 0, 4, 8. The switch, at 130,
     falls into an episode; so does no evaluation: they follow episodes 3 and 6."""
     teacher = root / f"runs/pretrain/cheetah_run/{method}/seed0/checkpoint.pt"
-    return ("finetune", "--method", method, "--teacher", teacher, "--runs", runs, *DEBUG,
-            "--steps", 260, "--eval-every", 120, "--slow-every", 4)
+    return ("finetune", "--method", method, "--runs", runs, *DEBUG, "--steps", 260,
+            "--eval-every", 120, "--slow-every", 4, "--teacher", teacher)
 
 def everything(run):
     """All that a run leaves behind and that must not depend on interruptions or on its place."""
@@ -2463,12 +2387,21 @@ def uncut(root, tmp_path_factory):
     "at the first decision in shifted colours, of a stack", "at a copy of its slow critic"])
 def test_finetuning_cut_and_resumed_equals_an_uncut_run_bit_for_bit(
         method, owner, name, call, root, uncut, tmp_path):
-    """Weights, Adam, slow critic, bonus, replay files, log: wherever Ctrl-C falls."""
-    argv = cut_command(root, tmp_path, method)
-    interrupt(owner, name, call, argv)
-    succeed(*argv)
+    """Weights, Adam, slow critic, bonus, replay files, log: wherever Ctrl-C falls. The pretraining
+    is left as it was (published: trained along), and no longer needed."""
+    *argv, source = cut_command(root, tmp_path, method)
+    teacher = Path(shutil.copy(source, tmp_path / "teacher.pt"))
+    interrupt(owner, name, call, (*argv, teacher))
+    assert teacher.read_bytes() == source.read_bytes()
+    teacher.unlink()
+    succeed(*argv[:-1])  # without --teacher
     run, = tmp_path.rglob("seed0")
     assert_identical(everything(run), uncut[method])
+    agent = torch.load(run / "checkpoint.pt")["agent"]
+    for key, value in torch.load(source)["model"].items():
+        if key.startswith("encoder."):
+            assert torch.equal(value, agent.get(key.replace("encoder", "teacher"), value))
+            assert not torch.equal(value, agent[f"model.{key}"])
     seconds, starts = [row["seconds"] for row in log_rows(run)], run / "provenance.jsonl"
     assert seconds == sorted(seconds) and len(starts.read_text().splitlines()) == 2
 
@@ -2585,37 +2518,26 @@ def test_twenty_kills_of_collect_pretrain_and_finetune_change_nothing(root, uncu
     inside = [moment[0] for _, moment in died if isinstance(moment, tuple)]
     assert len(died) >= 20 and min(inside.count(CHECKPOINT), inside.count(EPISODE)) >= 3
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A real file system of 8 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", folder]
-    if not shutil.which("mount") or subprocess.run(command, capture_output=True).returncode:
-        pytest.skip("mount is not permitted")
-    yield folder
-    subprocess.run(["umount", "--lazy", folder], check=True)
-
-def fill(folder):
-    """Leave no byte free."""
-    with contextlib.suppress(OSError), open(folder / "filler", "wb", buffering=0) as file:
-        while True:
-            file.write(bytes(4096))
-
 @pytest.mark.parametrize("stage, owner, name, call", [
     ("finetune", diswm.Replay, "add", 2), ("pretrain", diswm.Run, "record", 2),
     ("pretrain", diswm.Run, "save", 2), ("pretrain", diswm.os, "replace", 6)],
     ids=["episode", "TensorBoard", "config.json", "checkpoint"])
-def test_full_disk_loses_nothing(stage, owner, name, call, root, uncut, brief, small_disk):
-    """The run stops with one line, its last checkpoint loads, and with space it goes on."""
-    argv, run, whole = pretrain_command(root, small_disk), small_disk / PRETRAINED, brief
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_full_disk_loses_nothing(stage, owner, name, call, root, uncut, brief, tmp_path):
+    """The run stops with one line, its last checkpoint loads, and with space it goes on. Here the
+    operating system lets no file grow from a call on."""
+    argv, run, whole = pretrain_command(root, tmp_path), tmp_path / PRETRAINED, brief
     if stage == "finetune":
-        argv, run, whole = cut_command(root, small_disk), small_disk / FINETUNED, uncut["diswm"]
+        argv, run, whole = cut_command(root, tmp_path), tmp_path / FINETUNED, uncut["diswm"]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     with pytest.MonkeyPatch.context() as patch:
-        before_call(patch, owner, name, call, lambda: fill(small_disk))
-        refuse(*argv, says="No space left")
+        before_call(patch, owner, name, call,
+                    lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1])))
+        try:
+            refuse(*argv, says="File too large")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert diswm.read_checkpoint(run / "checkpoint.pt")
-    (small_disk / "filler").unlink()
     succeed(*argv)
     assert_identical(everything(run), whole)
 
