@@ -155,6 +155,7 @@ def train_fake(cfg, folder, env=None, fresh=False, stage="finetune", stop_after=
     run.record = counted
     with contextlib.suppress(Stop):
         diswm.train_agent(cfg, run, env, agent)
+    run.writer.close()  # its thread would write while a folder is removed
     run.lock.close()
     return SimpleNamespace(run=run, env=env, agent=agent, rows=count)
 
