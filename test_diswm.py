@@ -1340,7 +1340,7 @@ def test_replay_rows_align_image_with_the_action_and_reward_that_led_to_it(
     cfg = tiny_config("dreamerv2", steps=2 * length, switch=1.0, prefill=3, train_every=3,
                       batch_length=3, eval_episodes=1)
     env = CountingEnv(length, repeat, terminates=terminates)
-    with env, tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with env, tempfile.TemporaryDirectory() as folder:
         run = train_fake(cfg, folder, env).run
         episodes = [np.load(path) for path in (run.folder / "episodes").iterdir()]
     assert len(episodes) == 2 and run.done.updates > 0  # the agent, not only prefill, has acted
