@@ -163,13 +163,14 @@ class Config:
     wandb: str = ""  # project to log to as well, after: pip install wandb (ours)
 
     def __post_init__(self):
-        """Refuse values that are unknown or too low."""
+        """Refuse values that are unknown, too low or too high."""
         for name, value in vars(self).items():
             if name in CHOICES and value not in CHOICES[name]:
                 raise UsageError(f"{flag_name(name)} {value}: not of {', '.join(CHOICES[name])}")
             low = LOWEST.get(name, 1 if type(value) is int else 0)
-            if type(value) in (int, float) and not low <= value < 2**62:  # nor NaN
-                raise UsageError(f"{flag_name(name)} {value}: not {low} or more")
+            high = 1 if name in ("gamma", "lambda_", "kl_balance", "rho") else 1e18
+            if type(value) in (int, float) and not low <= value <= high:  # nor NaN
+                raise UsageError(f"{flag_name(name)} {value}: not from {low} to {high:g}")
 
 LOWEST = dict(seed=0, time_limit=0, prefill=0, imagine_starts=0, threads=0, eta_delay=-1,
               batch_length=2)  # else 1 for a whole number, 0 for others
@@ -1178,8 +1179,7 @@ class Run:
                  f"on {self.cfg.device} with {self.cfg.precision}")
         file = sys.stderr if sys.stderr.isatty() else io.StringIO()
         self.bar = tqdm(total=total, initial=begin, unit=f" {unit}", file=file)
-        self.bar._time = time.monotonic  # clocks may be set back
-        self.bar.start_t = self.bar.last_print_t = time.monotonic()
+        self.began = time.monotonic()  # other clocks may be set back
         if self.cfg.wandb:
             import wandb
             wandb.init(project=self.cfg.wandb, config=vars(self.cfg),
@@ -1188,7 +1188,7 @@ class Run:
 
     def record(self, **row):
         """Log a row of metrics, and save a checkpoint."""
-        done, seconds = getattr(self.done, self.unit), self.bar.format_dict["elapsed"]
+        done, seconds = getattr(self.done, self.unit), time.monotonic() - self.began
         self.done.seconds = self.before + seconds  # of all resumes
         row |= dict(seconds=self.done.seconds, rate=(done - self.bar.initial) / seconds)
         self.log += json.dumps(row) + "\n"

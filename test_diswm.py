@@ -2585,9 +2585,10 @@ def test_nan_stops_the_run_by_name_and_saves_nothing(loss, broken, term, root, u
     ("doctor --seed 1", "doctor --seed"), ("evaluate --run x --fresh", "evaluate --fresh"),
     ("finetune --preset huge", "paper small debug"), ("finetune --colors pink", "pink published"),
     ("finetune --method ppo", "ppo dreamerv2 no_distill"), ("finetune --steps 2.5", "--steps 2.5"),
-    ("finetune --steps 0", "--steps 0: not 1 or more"), ("finetune --eta nan", "--eta nan: not 0"),
+    ("finetune --steps 0", "--steps 0: not from 1"), ("finetune --eta nan", "--eta nan: not 0"),
     ("finetune --model-lr inf", "--model-lr inf: not 0"), ("finetune --seed -1", "--seed -1 0"),
-    ("pretrain --batch-length 1", "--batch-length 1: not 2")])
+    ("pretrain --batch-length 1", "--batch-length 1: not from 2 to"),
+    ("finetune --gamma 1.5", "--gamma 1.5: not from 0 to 1")])
 def test_wrong_usage_exits_2_and_lists_what_there_is(argv, says, workdir, monkeypatch):
     """Unknown task, flag, preset, method, command or value (NaN is less than nothing and more);
     nothing happens, and nothing is written."""
