@@ -68,7 +68,8 @@ for index in range(episodes):
 for name, those in dict(seen=seen, new=new).items():
     scores = [compare(agent, rows) for rows in those]
     result = dict(run="/".join(run.resolve().parts[-3:]), step=saved["done"]["env_steps"],
-                  phase=phase, episodes=name, returns=[float(rows["reward"].sum()) for rows in those])
+                  phase=phase, episodes=name,
+                  returns=[float(rows["reward"].sum()) for rows in those])
     for key in scores[0]:
         result[key] = [round(x, 3) for x in torch.stack([s[key] for s in scores]).mean(0).tolist()]
     print(json.dumps(result), flush=True)
