@@ -29,18 +29,19 @@ def score(predicted, true):
 
 
 @torch.no_grad()
-def compare(agent, rows):
-    """An episode's rows, as an array of agent_row, → dict of scores."""
-    model, batch = agent.model, {name: rows[name].copy()[None] for name in rows.dtype.names}
+def compare(model, rows, critic=None):
+    """A WorldModel and an episode's rows, as an array of agent_row, → dict of scores."""
+    batch = {name: rows[name].copy()[None] for name in rows.dtype.names}
     batch = diswm.to_device(batch, "cpu")
     out, reward, action = model(batch), batch["reward"][0], batch["action"][0]
     feat, post = out["feat"][0], {name: x[0] for name, x in out["post"].items()}
     scores = dict(reward=score(model.reward(feat[1:]), reward[1:]),
                   image=score(model.decoder(feat), batch["image"][0]))
-    count, returns = len(reward) - 200, 0.0
-    for k in reversed(range(200)):
-        returns = reward[k:k + count] + agent.cfg.gamma * returns
-    scores["critic"] = score(agent.behaviour.critic(feat[:count]), returns)
+    if critic:
+        count, returns = len(reward) - 200, 0.0
+        for k in reversed(range(200)):
+            returns = reward[k:k + count] + model.cfg.gamma * returns
+        scores["critic"] = score(critic(feat[:count]), returns)
     count, sums = len(reward) - 15, 0.0
     state = {name: x[:count] for name, x in post.items()}
     for k in range(1, 16):
@@ -52,24 +53,34 @@ def compare(agent, rows):
     return scores | {"sum of 15": score(*sums)}
 
 
-run, episodes = Path(sys.argv[1]), int((sys.argv + [4])[2])
-cfg, agent, saved = diswm.open_run(run / "checkpoint.pt", threads=1)
-phase, _ = diswm.color_phase(cfg, min(saved["done"]["env_steps"], cfg.steps - 1))
-torch.manual_seed(0)
-dtype = diswm.agent_row(agent.action_dim)
-seen = [np.load(path) for path in sorted((run / "episodes").glob("*.npy"))[-episodes:]]
-new, env = [], diswm.config_env(cfg, cfg.dst)
-for index in range(episodes):
-    episode, state = diswm.Episode(env, 10_000 + index, phase), None
-    while not episode.over:
-        action, state = agent.act(episode.rows[-1], state, explore=True)
-        episode.step(action)
-    new.append(np.array([tuple(row[name] for name in dtype.names) for row in episode.rows], dtype))
-for name, those in dict(seen=seen, new=new).items():
-    scores = [compare(agent, rows) for rows in those]
-    result = dict(run="/".join(run.resolve().parts[-3:]), step=saved["done"]["env_steps"],
-                  phase=phase, episodes=name,
-                  returns=[float(rows["reward"].sum()) for rows in those])
-    for key in scores[0]:
-        result[key] = [round(x, 3) for x in torch.stack([s[key] for s in scores]).mean(0).tolist()]
-    print(json.dumps(result), flush=True)
+def average(scores):
+    """The mean over episodes of each score, rounded."""
+    return {key: [round(x, 3) for x in torch.stack([s[key] for s in scores]).mean(0).tolist()]
+            for key in scores[0]}
+
+
+def main():
+    run, episodes = Path(sys.argv[1]), int((sys.argv + [4])[2])
+    cfg, agent, saved = diswm.open_run(run / "checkpoint.pt", threads=1)
+    phase, _ = diswm.color_phase(cfg, min(saved["done"]["env_steps"], cfg.steps - 1))
+    torch.manual_seed(0)
+    dtype, new = diswm.agent_row(agent.action_dim), []
+    seen = [np.load(path) for path in sorted((run / "episodes").glob("*.npy"))[-episodes:]]
+    env = diswm.config_env(cfg, cfg.dst)
+    for index in range(episodes):
+        episode, state = diswm.Episode(env, 10_000 + index, phase), None
+        while not episode.over:
+            action, state = agent.act(episode.rows[-1], state, explore=True)
+            episode.step(action)
+        rows = [tuple(row[name] for name in dtype.names) for row in episode.rows]
+        new.append(np.array(rows, dtype))
+    for name, those in dict(seen=seen, new=new).items():
+        result = dict(run="/".join(run.resolve().parts[-3:]), step=saved["done"]["env_steps"],
+                      phase=phase, episodes=name,
+                      returns=[float(rows["reward"].sum()) for rows in those])
+        scores = [compare(agent.model, rows, agent.behaviour.critic) for rows in those]
+        print(json.dumps(result | average(scores)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""world_model.py RUN UPDATES NAME [FIELD=VALUE ...] [clean] [glorot] [seed=K]: a new world model,
+without an agent, learns from the replay of RUN but its last five episodes, and is scored on those
+by limits.py: [R², correlation, mean prediction, mean truth]. clean: the same episodes, played anew
+without distractors, which leaves states and rewards as they were. Prints JSON at half time and at
+the end; image, reward and kl of training, mean of the last 100 updates, have "train" before them.
+"""
+
+import json
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from limits import average, compare, diswm
+
+
+def without_distractors(cfg, index, rows):
+    """The rows of a run's episode, with the pictures that the task has by itself."""
+    with diswm.config_env(cfg, cfg.dst) as env:
+        episode = diswm.Episode(env, diswm.derived_seed(cfg.seed, "finetune", index), "none")
+        for action in rows["action"][1:]:
+            episode.step(action)
+    assert np.allclose([row["reward"] for row in episode.rows], rows["reward"], atol=1e-6)
+    rows["image"] = [row["image"] for row in episode.rows]
+    return rows
+
+
+run, updates, name = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+given = dict(word.split("=") for word in sys.argv[4:] if "=" in word)
+seed = int(given.pop("seed", 0))
+cfg = diswm.read_checkpoint(run / "checkpoint.pt")["config"]
+changes = {field: type(getattr(cfg, field))(value) for field, value in given.items()}
+cfg = diswm.prepare_machine(replace(cfg, precision="auto", threads=1, **changes))
+episodes = [np.load(path) for path in sorted((run / "episodes").glob("*.npy"))]
+if "clean" in sys.argv[4:]:
+    episodes = [without_distractors(cfg, index, rows) for index, rows in enumerate(episodes)]
+torch.manual_seed(seed)
+model = diswm.WorldModel(cfg, *episodes[0].dtype["action"].shape)
+if "glorot" in sys.argv[4:]:
+    for module in model.modules():
+        if isinstance(module, (torch.nn.Linear, torch.nn.Conv2d, torch.nn.ConvTranspose2d)):
+            torch.nn.init.xavier_uniform_(module.weight)
+            torch.nn.init.zeros_(module.bias)
+optimizer, metrics = diswm.adam(model, cfg.model_lr), []
+with tempfile.TemporaryDirectory() as folder:
+    for index, rows in enumerate(episodes[:-5]):
+        np.save(Path(folder) / f"{index:06d}.npy", rows)
+    replay = diswm.Replay(folder, episodes[0].dtype)
+    for update in range(1, updates + 1):
+        torch.manual_seed(update)
+        batch = replay.sample(cfg.batch_size, cfg.batch_length, [7, update])
+        batch = diswm.to_device(batch, "cpu")
+        with model.autocast:
+            loss, terms = model.loss(model(batch), batch)
+        diswm.descend(loss, optimizer, cfg.grad_clip)
+        metrics.append({key: terms[key].detach() for key in ("image", "reward", "kl")})
+        if update in (updates // 2, updates):
+            torch.manual_seed(0)
+            train = diswm.mean_metrics(metrics[-100:])
+            row = dict(name=name, update=update) | {f"train {k}": train[k] for k in train}
+            scores = average([compare(model, rows) for rows in episodes[-5:]])
+            print(json.dumps(row | scores), flush=True)
