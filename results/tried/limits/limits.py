@@ -60,7 +60,7 @@ def average(scores):
 
 
 def main():
-    run, episodes = Path(sys.argv[1]), int((sys.argv + [4])[2])
+    run, episodes = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 4
     cfg, agent, saved = diswm.open_run(run / "checkpoint.pt", threads=1)
     phase, _ = diswm.color_phase(cfg, min(saved["done"]["env_steps"], cfg.steps - 1))
     torch.manual_seed(0)

@@ -16,12 +16,11 @@ import torch
 from limits import average, compare, diswm
 
 
-def without_distractors(cfg, index, rows):
+def without_distractors(env, seed, rows):
     """The rows of a run's episode, with the pictures that the task has by itself."""
-    with diswm.config_env(cfg, cfg.dst) as env:
-        episode = diswm.Episode(env, diswm.derived_seed(cfg.seed, "finetune", index), "none")
-        for action in rows["action"][1:]:
-            episode.step(action)
+    episode = diswm.Episode(env, seed, "none")
+    for action in rows["action"][1:]:
+        episode.step(action)
     assert np.allclose([row["reward"] for row in episode.rows], rows["reward"], atol=1e-6)
     rows["image"] = [row["image"] for row in episode.rows]
     return rows
@@ -35,7 +34,9 @@ changes = {field: type(getattr(cfg, field))(value) for field, value in given.ite
 cfg = diswm.prepare_machine(replace(cfg, precision="auto", threads=1, **changes))
 episodes = [np.load(path) for path in sorted((run / "episodes").glob("*.npy"))]
 if "clean" in sys.argv[4:]:
-    episodes = [without_distractors(cfg, index, rows) for index, rows in enumerate(episodes)]
+    with diswm.config_env(cfg, cfg.dst) as env:
+        episodes = [without_distractors(env, diswm.derived_seed(cfg.seed, "finetune", index), rows)
+                    for index, rows in enumerate(episodes)]
 torch.manual_seed(seed)
 model = diswm.WorldModel(cfg, *episodes[0].dtype["action"].shape)
 if "glorot" in sys.argv[4:]:
@@ -48,17 +49,17 @@ with tempfile.TemporaryDirectory() as folder:
     for index, rows in enumerate(episodes[:-5]):
         np.save(Path(folder) / f"{index:06d}.npy", rows)
     replay = diswm.Replay(folder, episodes[0].dtype)
-    for update in range(1, updates + 1):
-        torch.manual_seed(update)
-        batch = replay.sample(cfg.batch_size, cfg.batch_length, [7, update])
+    for index in range(updates):
+        torch.manual_seed(index)
+        batch = replay.sample(cfg.batch_size, cfg.batch_length, [7, index])
         batch = diswm.to_device(batch, "cpu")
         with model.autocast:
             loss, terms = model.loss(model(batch), batch)
         diswm.descend(loss, optimizer, cfg.grad_clip)
         metrics.append({key: terms[key].detach() for key in ("image", "reward", "kl")})
-        if update in (updates // 2, updates):
+        if index + 1 in (updates // 2, updates):
             torch.manual_seed(0)
             train = diswm.mean_metrics(metrics[-100:])
-            row = dict(name=name, update=update) | {f"train {k}": train[k] for k in train}
+            row = dict(name=name, update=index + 1) | {f"train {k}": train[k] for k in train}
             scores = average([compare(model, rows) for rows in episodes[-5:]])
             print(json.dumps(row | scores), flush=True)
