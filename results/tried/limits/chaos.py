@@ -8,44 +8,37 @@ import json
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
-from limits import diswm
-
-
-def decide(env, action):
-    """A decision in the simulator, without a picture → reward"""
-    low, high = env.unwrapped.action_space.low, env.unwrapped.action_space.high
-    action = low + (action + 1) / 2 * (high - low)
-    return sum(env.unwrapped.env.step(action).reward for _ in range(env.action_repeat))
-
+from limits import diswm, played_again
 
 run = Path(sys.argv[1])
 cfg = diswm.read_checkpoint(run / "checkpoint.pt")["config"]
-rng = np.random.default_rng(0)
+episodes = []
 with diswm.config_env(cfg, cfg.dst) as env:
-    physics, episodes = env.unwrapped.env.physics, []
     for path in sorted((run / "episodes").glob("*.npy"))[-5:]:
         rows = np.load(path)
-        seed = diswm.derived_seed(cfg.seed, "finetune", int(path.stem))
-        episode = diswm.Episode(env, seed, "none")
-        states = [physics.get_state()]
-        for action in rows["action"][1:]:
-            episode.step(action)
-            states.append(physics.get_state())
-        assert np.allclose([row["reward"] for row in episode.rows], rows["reward"], atol=1e-6)
+        states = [env.unwrapped.env.physics.get_state()
+                  for _ in played_again(env, cfg, int(path.stem), rows)]
         episodes.append((rows, states))
-    speeds = np.arange(len(states[0])) >= physics.model.nq
-    for error in (0.003, 0.01, 0.03, 0.1):
-        came = {1: [], 5: [], 15: []}
-        for rows, states in episodes:
-            for t in range(len(rows) - 15):
-                noise = error * np.where(speeds, 10, 1) * rng.standard_normal(len(speeds))
-                with physics.reset_context():
-                    physics.set_state(states[t] + noise)
-                for k in range(1, 16):
-                    reward = decide(env, rows["action"][t + k])
-                    if k in came:
-                        came[k].append((reward, rows["reward"][t + k]))
-        scores = {f"ahead {k}": round(np.corrcoef(np.transpose(pairs))[0, 1], 3)
-                  for k, pairs in came.items()}
-        print(json.dumps(dict(task=cfg.dst, error=error) | scores), flush=True)
+
+simulator, _ = diswm.bare_simulator(cfg.dst)  # draws no pictures
+simulator = gym.wrappers.RescaleAction(simulator, np.float32(-1), np.float32(1))
+simulator.reset()
+physics, rng = simulator.unwrapped.env.physics, np.random.default_rng(0)
+speeds = np.arange(len(states[0])) >= physics.model.nq
+for error in (0.003, 0.01, 0.03, 0.1):
+    came = {1: [], 5: [], 15: []}
+    for rows, states in episodes:
+        for t in range(len(rows) - 15):
+            noise = error * np.where(speeds, 10, 1) * rng.standard_normal(len(speeds))
+            with physics.reset_context():
+                physics.set_state(states[t] + noise)
+            for k in range(1, 16):
+                action = rows["action"][t + k]
+                reward = sum(simulator.step(action)[1] for _ in range(cfg.action_repeat))
+                if k in came:
+                    came[k].append((reward, rows["reward"][t + k]))
+    scores = {f"ahead {k}": round(np.corrcoef(np.transpose(pairs))[0, 1], 3)
+              for k, pairs in came.items()}
+    print(json.dumps(dict(task=cfg.dst, error=error) | scores), flush=True)

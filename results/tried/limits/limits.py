@@ -59,6 +59,16 @@ def average(scores):
             for key in scores[0]}
 
 
+def played_again(env, cfg, index, rows):
+    """A run's episode, played anew without distractors: its rows in turn, with the same rewards."""
+    episode = diswm.Episode(env, diswm.derived_seed(cfg.seed, "finetune", index), "none")
+    yield episode.rows[0]
+    for action, reward in zip(rows["action"][1:], rows["reward"][1:], strict=True):
+        episode.step(action)
+        assert np.isclose(episode.rows[-1]["reward"], reward, atol=1e-6)
+        yield episode.rows[-1]
+
+
 def main():
     run, episodes = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 4
     cfg, agent, saved = diswm.open_run(run / "checkpoint.pt", threads=1)

@@ -13,18 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from limits import average, compare, diswm
-
-
-def without_distractors(env, seed, rows):
-    """The rows of a run's episode, with the pictures that the task has by itself."""
-    episode = diswm.Episode(env, seed, "none")
-    for action in rows["action"][1:]:
-        episode.step(action)
-    assert np.allclose([row["reward"] for row in episode.rows], rows["reward"], atol=1e-6)
-    rows["image"] = [row["image"] for row in episode.rows]
-    return rows
-
+from limits import average, compare, diswm, played_again
 
 run, updates, name = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 given = dict(word.split("=") for word in sys.argv[4:] if "=" in word)
@@ -35,8 +24,8 @@ cfg = diswm.prepare_machine(replace(cfg, precision="auto", threads=1, **changes)
 episodes = [np.load(path) for path in sorted((run / "episodes").glob("*.npy"))]
 if "clean" in sys.argv[4:]:
     with diswm.config_env(cfg, cfg.dst) as env:
-        episodes = [without_distractors(env, diswm.derived_seed(cfg.seed, "finetune", index), rows)
-                    for index, rows in enumerate(episodes)]
+        for index, rows in enumerate(episodes):
+            rows["image"] = [row["image"] for row in played_again(env, cfg, index, rows)]
 torch.manual_seed(seed)
 model = diswm.WorldModel(cfg, *episodes[0].dtype["action"].shape)
 if "glorot" in sys.argv[4:]:
@@ -60,6 +49,7 @@ with tempfile.TemporaryDirectory() as folder:
         if (index + 1) % 300 == 0:
             torch.manual_seed(0)
             train = diswm.mean_metrics(metrics[-100:])
-            row = dict(name=name, update=index + 1) | {f"train {k}": train[k] for k in train}
+            row = {f"train {key}": round(value, 3) for key, value in train.items()}
+            row |= dict(name=name, update=index + 1, episodes=len(episodes))
             scores = average([compare(model, rows) for rows in episodes[-5:]])
             print(json.dumps(row | scores), flush=True)
